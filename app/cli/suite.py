@@ -7,16 +7,24 @@ from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
-from app.cli.lookup import find_sequence, read_settings
-from app.cli.output import AsJson, DataDir, Devices, show
+from app.cli.lookup import cluster_settings, find_sequence, read_settings
+from app.cli.output import AsJson, DataDir, Devices, Engine, show
+from app.jobs.engines.ray_engine import reached_cluster
+from app.settings import LOCAL
 from physhandi.data.sequence import Sequence
 from physhandi.devices import ONLY_CARD, pick_devices
 from physhandi.errors import UsageError
 from physhandi.progress import watched
+
+MOST_PROCESSES = 64
+"""Processes on this machine at most."""
+_MOST_JOBS = 1024
+if TYPE_CHECKING:
+    from physhandi.synthetic.suite.suite import Suite
 
 _OF_SUITE = arg(help_behavior_hint="(default: the suite's)")
 
@@ -41,6 +49,7 @@ def evaluate_suite(
     out: Path | None = None,
     jobs: Annotated[int | None, arg(help_behavior_hint="(default: one each device)")] = None,
     device: Devices = "auto",
+    engine: Engine = None,
     as_json: AsJson = False,
     data_dir: DataDir = None,
 ) -> None:
@@ -61,12 +70,14 @@ def evaluate_suite(
             folder, whose suites the server shows.
         jobs: How many sequences and cells are computed side by side, each in a process of its own;
             with several GPUs they take turns with them. Then the times in the table are those of a
-            shared machine.
+            shared machine. On a cluster each is a job of its own, and there are as many as all live
+            nodes take if this is left out.
 
     Raises:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
-    from app.cli.suite_workers import MOST_PROCESSES, SuiteWorkers
+    from app.cli.suite_jobs import WORKER, SuiteJobs
+    from app.cli.suite_processes import SuiteProcesses
     from physhandi.synthetic.suite.evaluation import Order
     from physhandi.synthetic.suite.evaluation import evaluate_suite as compare
     from physhandi.synthetic.suite.folder import check_folder
@@ -95,26 +106,25 @@ def evaluate_suite(
         for one in searched_from(parse_method(method), search_seeds):
             method_settings(one, settings)
     check_seeds(seeds := seeds or chosen.seeds)
-    devices = pick_devices(device)
+    server = read_settings(data_dir=data_dir, engine=engine)
+    is_here = server.engine == LOCAL
+    devices = pick_devices(device) if is_here else (device,)
     named = [find_sequence(name, data_dir) for name in sequences]
-    folders = read_settings(data_dir=data_dir).suite_dir
-    if named:
-        title, cases = "Named sequences", [sequence.name for sequence in named]
-        out = out or folders / _name_for(named)
-    else:
-        title, cases = f"Suite {chosen.name}", [s.name(n) for s in chosen.scenes for n in seeds]
-        of_seeds = "" if set(seeds) == set(chosen.seeds) else f"-seeds-{_joined(seeds)}"
-        out = out or folders / f"{chosen.name}{of_seeds}"
+    title, cases, place = _table_of(chosen, seeds, named)
+    out = out or server.suite_dir / place
     check_folder(out, title, cases)
-    jobs = len(devices) if jobs is None else jobs
-    if not 1 <= jobs <= MOST_PROCESSES:
-        raise UsageError(f"--jobs {jobs} makes no sense; choose 1 to {MOST_PROCESSES}.")
+    cluster = None if is_here else reached_cluster(cluster_settings(server, device), WORKER)
+    jobs = _checked_jobs(jobs, len(devices) if cluster is None else cluster.slots, is_here=is_here)
     with watched(True) as progress, ExitStack() as stack:
         # Everything that a user may have got wrong is told before they are started.
-        make, workers = partial(make_one_by_one, progress=progress), None
-        if jobs > 1:
-            workers = stack.enter_context(SuiteWorkers(jobs, progress, devices))
-            make = workers.make
+        workers = None
+        if cluster is not None:
+            workers = SuiteJobs(cluster, out, progress, most=jobs, grace_s=server.cancel_grace_s)
+        elif jobs > 1:
+            workers = stack.enter_context(SuiteProcesses(jobs, progress, devices))
+        make = partial(make_one_by_one, progress=progress) if workers is None else workers.make
+        environment = workers.environment() if isinstance(workers, SuiteJobs) else {}
+        alone = ONLY_CARD if workers and devices[0] != "cpu" else devices[0]
         order = Order(
             title=title,
             recordings=tuple(named) or make_recordings(chosen, seeds, out / "sequences", make),
@@ -122,15 +132,42 @@ def evaluate_suite(
             protocols=protocols or chosen.protocols,
             settings=settings,
             search_seeds=search_seeds,
-            device=ONLY_CARD if workers and devices[0] != "cpu" else devices[0],
-            command=_command(suite, given, sequences, jobs, ",".join(devices)),
+            device=str(environment.get("device", alone)),
+            command=_command(
+                suite, {**given, "sequences": sequences}, jobs, ",".join(devices), server.engine
+            ),
             at_once=jobs,
+            environment=environment,
         )
         for recording in order.recordings:
             recording.validate(reads_color=False)
         fill = None if workers is None else workers.fill(order, out)
         result = compare(order, out, progress, fill=fill)
     show(result | {"seconds": round(time.monotonic() - start, 1)}, as_json=as_json)
+
+
+def _table_of(
+    chosen: "Suite", seeds: tuple[int, ...], named: list[Sequence]
+) -> tuple[str, list[str], str]:
+    """Give the title of a table, its cases, and the name of its folder."""
+    if named:
+        return "Named sequences", [sequence.name for sequence in named], _name_for(named)
+    cases = [scene.name(seed) for scene in chosen.scenes for seed in seeds]
+    of_seeds = "" if set(seeds) == set(chosen.seeds) else f"-seeds-{_joined(seeds)}"
+    return f"Suite {chosen.name}", cases, f"{chosen.name}{of_seeds}"
+
+
+def _checked_jobs(jobs: int | None, places: int, *, is_here: bool) -> int:
+    """Choose how many pieces of work are done side by side; one in each place if none is named.
+
+    Raises:
+        UsageError: If the number makes no sense.
+    """
+    jobs = max(1, places) if jobs is None else jobs
+    most = MOST_PROCESSES if is_here else _MOST_JOBS
+    if not 1 <= jobs <= most:
+        raise UsageError(f"--jobs {jobs} makes no sense; choose 1 to {most}.")
+    return jobs
 
 
 def _name_for(sequences: list[Sequence]) -> str:
@@ -149,15 +186,16 @@ def _joined(seeds: Iterable[int]) -> str:
 def _command(
     suite: str | None,
     given: Mapping[str, tuple[object, ...]],
-    sequences: tuple[str, ...],
     jobs: int,
     device: str,
+    engine: str,
 ) -> str:
     """Write the command again, with all that decides the result."""
     parts = ["physhandi", "evaluate", "suite"]
-    if suite or not sequences:
+    if suite or not given["sequences"]:
         parts += ["--suite", suite or "tiny"]
-    for name, values in (*given.items(), ("sequences", sequences)):
+    for name, values in given.items():
         parts += [f"--{name}", *(str(value) for value in values)] if values else []
     parts += ["--jobs", str(jobs)] if jobs > 1 else []
+    parts += [] if engine == LOCAL else ["--engine", engine]
     return shlex.join([*parts, "--device", device])

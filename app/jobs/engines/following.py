@@ -84,6 +84,10 @@ class FollowedRun:
         _error: BaseException | None,
         _trace: TracebackType | None,
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the run to others; what works on it goes on."""
         self._claim.close()
 
     def look(self) -> bool:

@@ -66,6 +66,9 @@ FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationErro
 """Errors after which a method's output counts as missing. Any other error stops the suite, also a
 setting that only the fit finds invalid."""
 
+UNSEEN = "unseen"
+"""Variant of cells whose object was fitted on another recording."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
@@ -100,7 +103,13 @@ class Bench:
     """Computes and scores the cells of one suite folder."""
 
     def __init__(
-        self, out: Path, *, common: Mapping[str, Any], device: str, progress: Progress
+        self,
+        out: Path,
+        *,
+        common: Mapping[str, Any],
+        device: str,
+        progress: Progress,
+        device_name: str | None = None,
     ) -> None:
         """Prepare; nothing is written yet.
 
@@ -109,12 +118,15 @@ class Bench:
             common: Settings that all methods share.
             device: Warp device.
             progress: Receives a report of every iteration.
+            device_name: What the device calls itself, if it is another machine's whose finished
+                cells are looked at here; None asks it.
         """
         self.out = out
         self.common = dict(common)
         self.device = device
-        name = processor_name() if device == "cpu" else describe_device(device)
-        self.device_name = f"{device} {name}"
+        if device_name is None:
+            device_name = processor_name() if device == "cpu" else describe_device(device)
+        self.device_name = f"{device} {device_name}"
         self.progress = progress
         self._settings: dict[str, dict[str, Any]] = {}
         self._finished: dict[Path, RunFolder] = {}
@@ -167,6 +179,39 @@ class Bench:
             curves=curves,
         )
 
+    def without_output(
+        self, method: Method, recording: Sequence, variant: str, why: str
+    ) -> Outcome | None:
+        """Score the static object in the place of a method whose output was lost.
+
+        Args:
+            method: The method.
+            recording: What it is scored against.
+            variant: Its input, or `UNSEEN`.
+            why: What became of its output.
+
+        Returns:
+            None if the static object's run is not there either; nothing is computed here.
+        """
+        folder = self._folder(METHODS["static"], recording, "recording")
+        if not (folder / "run.yaml").is_file():
+            return None
+        reference = RunFolder.open(folder)
+        if not reference.is_published:
+            return None
+        is_unseen = variant == UNSEEN
+        scored = _as_one_split(recording) if is_unseen else recording
+        report, curves = self.score(None, reference, scored)
+        return Outcome(
+            method=method.name,
+            case=recording.name,
+            variant=variant if is_unseen else _given(method, variant),
+            run="",
+            error=why,
+            report=report,
+            curves=curves,
+        )
+
     def lacks(self, method: Method, recording: Sequence, variant: str = "recording") -> str:
         """Explain what a recording lacks for a variant of it; empty if nothing."""
         if method.gets == "truth" and true_surface(read_truth(recording.folder)) is None:
@@ -199,7 +244,7 @@ class Bench:
             return Outcome(
                 method=method.name,
                 case=recording.name,
-                variant="unseen",
+                variant=UNSEEN,
                 run=run.folder.name,
                 report=report,
                 curves=curves,
@@ -226,7 +271,7 @@ class Bench:
         return Outcome(
             method=method.name,
             case=recording.name,
-            variant="unseen",
+            variant=UNSEEN,
             run=name,
             error=error,
             report=report,

@@ -14,6 +14,7 @@ from typing import Any
 from physhandi.data.environment import describe_environment
 from physhandi.data.files import named_fields
 from physhandi.data.layout import SequenceFiles
+from physhandi.data.run_folder import now
 from physhandi.data.sequence import Sequence
 from physhandi.devices import describe_device
 from physhandi.errors import MissingInputError, SequenceError, UsageError
@@ -25,7 +26,7 @@ from physhandi.synthetic.code_version import (
     outdated,
     recorded_version,
 )
-from physhandi.synthetic.suite.cells import FAILURES, Bench, Outcome
+from physhandi.synthetic.suite.cells import FAILURES, UNSEEN, Bench, Outcome
 from physhandi.synthetic.suite.folder import SuiteFolder, contact_kind, figures_of
 from physhandi.synthetic.suite.methods import (
     METHODS,
@@ -68,6 +69,8 @@ class Order:
     """Command line of the evaluation, for the report."""
     at_once: int = 1
     """Cells that are computed in parallel and share the machine."""
+    environment: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Machines that compute the cells, as `describe_environment` does; empty for this one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,8 +91,9 @@ class Task:
     """Sequence on which the object is fitted, if it is another one."""
 
 
-Fill = Callable[[Many[Task]], Iterator[int]]
-"""Computes cells elsewhere and yields their indices as they finish, each once."""
+Fill = Callable[[Many[Task]], Iterator[tuple[int, str]]]
+"""Computes cells elsewhere and yields their indices as they finish, each once; with a reason if the
+cell was lost with the process that computed it, else with nothing."""
 
 
 def evaluate_suite(
@@ -132,7 +136,8 @@ def evaluate_suite(
         return folder.write(_environment(order), work.skipped, missing, recordings)
 
     try:
-        for number in range(len(tasks)) if fill is None else fill(tasks):
+        here = ((number, "") for number in range(len(tasks)))
+        for number, lost in here if fill is None else fill(tasks):
             task = tasks[number]
             is_other, before = task.protocol != before, task.protocol
             if folder.done and (is_other or time.monotonic() - written > WRITE_EVERY):
@@ -140,7 +145,7 @@ def evaluate_suite(
             progress.check_cancelled()
             message = f"{task.method.name}, {task.recording.name}"
             progress.report("suite", finished, len(tasks), message=message)
-            cell = work.cell(task)
+            cell = work.lost_cell(task, lost) if lost else work.cell(task)
             finished += 1
             if cell is not None:
                 folder.done.append(cell)
@@ -178,7 +183,13 @@ class _Work:
     """Computes cells, and collects the reasons why some are skipped."""
 
     def __init__(self, order: Order, out: Path, progress: Progress) -> None:
-        self.bench = Bench(out, common=order.settings, device=order.device, progress=progress)
+        self.bench = Bench(
+            out,
+            common=order.settings,
+            device=order.device,
+            progress=progress,
+            device_name=order.environment.get("device_name"),
+        )
         self.recordings = order.recordings
         self.skipped: list[str] = []
         self._blind: dict[str, str] = {}
@@ -187,6 +198,17 @@ class _Work:
         """Compute a cell and describe it; None if it is skipped."""
         outcome = self.outcome(task)
         return None if outcome is None else self._described(task, outcome)
+
+    def lost_cell(self, task: Task, why: str) -> dict[str, Any] | None:
+        """Describe a cell that was lost as one without output; None if it cannot be scored."""
+        where = f"{task.method.name}, {task.recording.name}, {task.split}"
+        _LOG.warning("%s: %s", where, why)
+        variant = task.variant if task.fitted is None else UNSEEN
+        outcome = self.bench.without_output(task.method, task.recording, variant, why)
+        if outcome is None:
+            self._skip(f"{where}: {why}")
+            return None
+        return self._described(task, outcome)
 
     def outcome(self, task: Task) -> Outcome | None:
         """Compute a cell; None if it is skipped."""
@@ -313,6 +335,8 @@ def _oracles(methods: Many[Method]) -> list[str]:
 
 
 def _environment(order: Order) -> dict[str, Any]:
+    if order.environment:
+        return {**order.environment, "started": now()}
     return describe_environment(order.device, describe_device(order.device))
 
 

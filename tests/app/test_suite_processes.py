@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import threading
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,12 @@ import pytest
 from suite_world import order_of, table, write_told
 from waiting import LIMIT_S
 
-from app.cli import suite_workers
-from app.cli.suite_workers import SuiteWorkers, order_from_json, order_to_json
+from app.cli import suite_processes
+from app.cli.suite_processes import SuiteProcesses
+from app.cli.suite_work import in_order, order_from_json, order_to_json, told_of
 from physhandi.data.lease import locked_file
 from physhandi.data.sequence import Sequence
-from physhandi.errors import CancelledError, RunError, UsageError
+from physhandi.errors import CancelledError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.run import Run
 from physhandi.synthetic.suite.evaluation import Order, evaluate_suite, filler, list_tasks
@@ -45,7 +47,7 @@ def children() -> list[psutil.Process]:
     found = []
     for process in psutil.Process().children():
         with suppress(psutil.Error):
-            if "app.cli.suite_workers" in process.cmdline():
+            if "app.cli.suite_processes" in process.cmdline():
                 found.append(process)
     return found
 
@@ -77,11 +79,11 @@ def test_two_processes_give_the_table_of_one_fill_each_cell_once_and_tell_what_i
 ) -> None:
     evaluate_suite(order, tmp_path / "one")
     progress = Watched()
-    with SuiteWorkers(2, progress) as workers:
+    with SuiteProcesses(2, progress) as workers:
         out = tmp_path / "two"
         found = evaluate_suite(order, out, progress, fill=workers.fill(order, out))
         shares = [process.cpu_affinity() for process in children()]
-        assert sorted(shares) == suite_workers._shares(2)
+        assert sorted(shares) == suite_processes._shares(2)
         told_last = progress.told[-1]
         refuse_in_their_words(workers, order, tmp_path)
     assert (found["cells"], found["failed"], found["skipped"]) == (CELLS, 0, [])
@@ -101,7 +103,7 @@ def test_two_processes_give_the_table_of_one_fill_each_cell_once_and_tell_what_i
     assert "shared by 2 cells at a time" in (out / "report.md").read_text()
 
 
-def refuse_in_their_words(workers: SuiteWorkers, order: Order, folder: Path) -> None:
+def refuse_in_their_words(workers: SuiteProcesses, order: Order, folder: Path) -> None:
     """See that what a process finds wrong is told in its words, and that it works on."""
     wrong = replace(order, methods=("quick@object_.search.population=1",))
     told = r"population is 1; expected a whole number from 2"
@@ -117,7 +119,7 @@ def test_whatever_is_made_of_other_cells_comes_last(recordings: tuple[Sequence, 
     methods = ("quick+last_residual", "static", "quick")
     asked = order_of(recordings, methods=methods, protocols=("unseen", "main"))
     tasks = list(list_tasks(asked, [parse_method(name) for name in methods]))
-    placed = [tasks[number] for number in suite_workers._in_order(tasks)]
+    placed = [tasks[number] for number in in_order(tasks)]
     assert sorted(map(id, placed)) == sorted(map(id, tasks))
     assert [(t.method.name, t.recording.name) for t in placed if t.protocol == "main"] == [
         *(("static", "low"), ("static", "high"), ("quick", "low"), ("quick", "high")),
@@ -162,35 +164,80 @@ def test_a_cell_that_another_process_fills_is_waited_for_and_who_does_is_told(
 
 def test_what_a_process_does_is_told_in_a_few_words() -> None:
     said = {"stage": "search", "iteration": 3, "total": 8}
-    assert suite_workers._told_of("quick, low", said) == "quick, low search 37 %"
+    assert told_of("quick, low", said) == "quick, low search 37 %"
     said = {"stage": "waits for process 7 on vm", "iteration": 0, "total": 0}
-    assert suite_workers._told_of("quick, low", said) == "quick, low waits for process 7 on vm"
+    assert told_of("quick, low", said) == "quick, low waits for process 7 on vm"
 
 
-def test_a_process_that_is_killed_is_told_and_the_command_goes_on(
-    tmp_path: Path, order: Order
-) -> None:
-    class Killer(Watched):
-        def report(self, *about: object, **more: object) -> None:
-            super().report(*about, **more)  # type: ignore[arg-type]  # passed on as it came
-            busy = [m for *_, m in self.told if m.startswith("static, low") and "%" in m]
-            if busy and len(children()) == 2:
-                children()[0].send_signal(signal.SIGKILL)
+class Killer(Watched):
+    """Kills the process that is at work on some cell, again and again."""
 
-    out = tmp_path / "suite"
-    told = r"ended while it worked on .*exit code -9.*--jobs"
-    with pytest.raises(RunError, match=told), SuiteWorkers(2, Killer()) as workers:
-        evaluate_suite(order, out, fill=workers.fill(order, out))
+    def __init__(self, cell: str, times: int) -> None:
+        super().__init__()
+        self._cell = cell
+        self._victims: set[int] = set()
+        self._times = times
+
+    def report(self, *about: Any, **more: Any) -> None:
+        super().report(*about, **more)
+        alive = [process for process in children() if process.pid not in self._victims]
+        is_busy = self.told[-1][3].startswith(self._cell) and alive
+        if is_busy and len(self._victims) < self._times:
+            self._victims.add(alive[0].pid)
+            alive[0].send_signal(signal.SIGKILL)
+
+
+@pytest.fixture
+def small(recordings: tuple[Sequence, ...]) -> Order:
+    return order_of(recordings[:1], methods=("static", "quick"), protocols=("main",))
+
+
+def test_a_cell_whose_process_is_killed_is_computed_once_more(tmp_path: Path, small: Order) -> None:
+    killer = Killer("quick, low", 1)
+    with SuiteProcesses(1, killer) as workers:
+        found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
     assert children() == []
-    found = evaluate_suite(order, out)
-    assert (found["cells"], found["failed"]) == (CELLS, 0)
+    assert (found["cells"], found["failed"], found["skipped"]) == (2, 0, [])
+
+
+def test_a_cell_whose_process_is_killed_twice_is_one_failed_cell_and_tried_by_the_next_command(
+    tmp_path: Path, small: Order, caplog: pytest.LogCaptureFixture
+) -> None:
+    killer = Killer("quick, low", 2)
+    with SuiteProcesses(1, killer) as workers:
+        found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
+    assert (found["cells"], found["failed"], found["skipped"]) == (2, 1, [])
+    told = r"The process that worked on it ended, 2 times (exit code -9). If memory ran out, take"
+    assert f"quick, low, main: {told}" in caplog.text
+    (cell,) = (c for c in json.loads((tmp_path / "cells.json").read_text())["cells"] if c["error"])
+    assert (cell["method"], cell["case"]) == ("quick", "low")
+    assert cell["error"].startswith(told)
+    scored = table(tmp_path)
+    key = ("future", "track_error")
+    # As any method without output, it counts as the static object.
+    assert scored["quick", *key]["mean"] == scored["static", *key]["mean"]
+    found = evaluate_suite(small, tmp_path)
+    assert (found["cells"], found["failed"]) == (2, 0)
+    assert table(tmp_path)["quick", *key]["mean"] != scored["static", *key]["mean"]
+
+
+def test_a_lost_cell_without_which_nothing_can_be_scored_is_left_out_and_says_so(
+    tmp_path: Path, small: Order
+) -> None:
+    def lose(tasks: object) -> Iterator[tuple[int, str]]:
+        yield from ((number, "It was lost.") for number in range(2))
+
+    found = evaluate_suite(small, tmp_path, fill=lose)
+    assert (found["cells"], found["failed"]) == (0, 0)
+    assert found["skipped"] == [f"{m}, low, main: It was lost." for m in ("static", "quick")]
+    assert not list((tmp_path / "cells").glob("*")) if (tmp_path / "cells").exists() else True
 
 
 def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
     tmp_path: Path, order: Order
 ) -> None:
     progress = Watched(stop_at="quick, low")
-    with pytest.raises(CancelledError), SuiteWorkers(2, progress) as workers:
+    with pytest.raises(CancelledError), SuiteProcesses(2, progress) as workers:
         evaluate_suite(order, tmp_path, progress, fill=workers.fill(order, tmp_path))
     assert children() == []
     stored = json.loads((tmp_path / "cells.json").read_text())
@@ -220,11 +267,4 @@ def test_processors_are_shared_out(
     monkeypatch: pytest.MonkeyPatch, processors: set[int], count: int, shares: list[list[int]]
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: processors)
-    assert suite_workers._shares(count) == shares
-
-
-def test_a_number_of_processes_that_makes_no_sense_is_refused() -> None:
-    for count in (0, 1, 65):
-        with pytest.raises(UsageError, match=f"{count} processes make no sense"):
-            SuiteWorkers(count, NullProgress())
-    assert children() == []
+    assert suite_processes._shares(count) == shares

@@ -1,0 +1,137 @@
+"""A suite whose cells are jobs of a cluster: same table, each cell once, nothing left behind."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ray_api import TOKEN, MadeCluster, made_cluster
+from suite_world import order_of, table, write_told
+from waiting import until
+
+from app.cli.lookup import read_settings
+from app.cli.suite_jobs import WORKER, SuiteJobs
+from app.jobs.engines import ray_engine
+from app.jobs.engines.ray_engine import RayEngine
+from app.jobs.processes import marked_processes
+from physhandi.data.environment import describe_environment
+from physhandi.errors import UsageError
+from physhandi.progress import Progress
+from physhandi.run import Run
+from physhandi.synthetic.suite.evaluation import Order, evaluate_suite
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[MadeCluster]:
+    """A cluster whose jobs are processes here."""
+    monkeypatch.setattr(ray_engine, "_INTERVAL_S", 0.0)
+    monkeypatch.setenv("PHYSHANDI_ENGINE_TOKEN", TOKEN)
+    monkeypatch.setenv("PHYSHANDI_CLUSTER_PYTHON", sys.executable)
+    with made_cluster() as made:
+        made.executes = True
+        yield made
+
+
+class Deed(Progress):
+    """Does something once, as soon as a cell is told to be at work."""
+
+    def __init__(self, cell: str = "", deed: Callable[[], object] = lambda: None) -> None:
+        self.told: list[tuple[str, int, int, str]] = []
+        self._cell = cell
+        self._deed: Callable[[], object] | None = deed
+
+    def report(
+        self, stage: str, iteration: int, total: int, loss: Any = None, message: str = ""
+    ) -> None:
+        self.told.append((stage, iteration, total, message))
+        if self._deed is not None and self._cell and self._cell in message:
+            deed, self._deed = self._deed, None
+            deed()
+
+
+def jobs_of(cluster: MadeCluster, out: Path, progress: Progress) -> SuiteJobs:
+    engine = RayEngine.of(read_settings(engine=cluster.address), WORKER)
+    engine.refresh()
+    return SuiteJobs(engine, out, progress, most=2, grace_s=0.3)
+
+
+@pytest.fixture
+def order(tmp_path: Path) -> Order:
+    recording = write_told(tmp_path / "low", 0.12)
+    return order_of((recording,), methods=("static", "rigid_follow"), protocols=("main",))
+
+
+def left_in(out: Path) -> list[str]:
+    return [cookie for _, cookie in marked_processes() if str(out) in cookie]
+
+
+def test_a_cluster_gives_the_same_table_although_a_node_is_lost(
+    tmp_path: Path, cluster: MadeCluster, order: Order
+) -> None:
+    out = tmp_path / "suite"
+
+    def lose() -> None:
+        cluster.kill(cluster.submitted[-1]["submission_id"])
+
+    progress = Deed("rigid_follow, low", lose)
+    jobs = jobs_of(cluster, out, progress)
+    environment = jobs.environment()
+    assert (environment["device"], "started" in environment) == ("cpu", False)
+    there = replace(order, environment=environment)
+    found = evaluate_suite(there, out, progress, fill=jobs.fill(there, out))
+    assert (found["cells"], found["failed"], found["skipped"]) == (2, 0, [])
+    names = [job["submission_id"].rsplit("-", 3) for job in cluster.submitted]
+    starts = sorted((name, int(start)) for name, _, start, _ in names)
+    assert [start for start in starts if start[1] == 2] == [("rigid_follow__low", 2)]
+    assert [name for name, start in starts if start == 1] == [
+        *("rigid_follow__low", "static__low", "the_nodes")
+    ]
+    evaluate_suite(order, tmp_path / "here")
+    one, other = table(tmp_path / "here"), table(out)
+    assert list(one) == list(other)
+    for key, row in one.items():
+        if key[1] != "runtime":  # Sums over other numbers of threads are rounded otherwise.
+            assert float(other[key]["mean"]) == pytest.approx(float(row["mean"]), rel=2e-3), key
+    assert one["rigid_follow", "future", "track_error"]["mean"] != "0"
+    # What is finished was filled there alone, and needs no job any more.
+    assert [path.name for path in (out / "jobs").iterdir()] == ["environment.json"]
+    assert {Run.open(cell).is_published for cell in (out / "cells").iterdir()} == {True}
+    assert any("static, low" in message for *_, message in progress.told)
+    stored = json.loads((out / "cells.json").read_text())["about"]["environment"]
+    assert stored["device_name"] == environment["device_name"]
+
+
+def test_ctrl_c_ends_all_jobs_and_the_same_command_goes_on(
+    tmp_path: Path, cluster: MadeCluster, order: Order
+) -> None:
+    out = tmp_path / "suite"
+
+    def interrupt() -> None:
+        until(lambda: left_in(out))
+        raise KeyboardInterrupt
+
+    progress = Deed("static, low", interrupt)
+    fill = jobs_of(cluster, out, progress).fill(order, out)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate_suite(order, out, progress, fill=fill)
+    assert left_in(out) == []
+    assert len(set(cluster.stopped)) == len(cluster.submitted) == 2
+    assert "nothing is left" in progress.told[-1][0]
+    fill = jobs_of(cluster, out, Deed()).fill(order, out)
+    found = evaluate_suite(order, out, fill=fill)
+    assert (found["cells"], found["failed"]) == (2, 0)
+
+
+def test_nodes_that_differ_stop_the_suite_in_their_words(
+    tmp_path: Path, cluster: MadeCluster, order: Order
+) -> None:
+    out = tmp_path / "suite"
+    environment = describe_environment("cpu") | {"device_name": "abacus"}
+    other = replace(order, environment=environment)
+    fill = jobs_of(cluster, out, Deed()).fill(other, out)
+    with pytest.raises(UsageError, match="where the table's others have abacus"):
+        evaluate_suite(other, out, fill=fill)
+    assert left_in(out) == []
