@@ -30,6 +30,7 @@ class ImpatientProtocol(H11Protocol):
     _timer: asyncio.TimerHandle | None = None
     _received = 0
     _received_then = 0
+    _is_handed_over = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """Begin to wait for the first request."""
@@ -42,6 +43,11 @@ class ImpatientProtocol(H11Protocol):
         super().data_received(data)
         self._follow()
 
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        """Hand the connection over: what comes from now on is no part of a request."""
+        super().handle_websocket_upgrade(event)
+        self._is_handed_over = True
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the time."""
         self._wait_for(None)
@@ -49,7 +55,7 @@ class ImpatientProtocol(H11Protocol):
 
     def _follow(self) -> None:
         """Find out what is missing of a request, and give that its time if it is something new."""
-        state = self.conn.their_state
+        state = None if self._is_handed_over else self.conn.their_state
         part: _Part | None = (
             "head" if state is h11.IDLE else "body" if state is h11.SEND_BODY else None
         )

@@ -3,7 +3,8 @@
 import json
 import socket
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -13,9 +14,11 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket
 from uvicorn.server import ServerState
 from waiting import LIMIT_S, until
+from websockets.sync.client import connect
 
 from app.slow_requests import ImpatientProtocol
 
@@ -160,32 +163,63 @@ class Hasty(ImpatientProtocol):
     head_s, body_s = 0.1, 0.1
 
 
+@contextmanager
+def serving(listener: socket.socket, *routes: BaseRoute) -> Iterator[None]:
+    """Serve what has connected to a socket, and what does."""
+    app = Starlette(routes=routes)
+    server = uvicorn.Server(uvicorn.Config(app, http=Hasty, log_level="critical"))
+    thread = threading.Thread(target=server.run, args=([listener],))
+    thread.start()
+    until(lambda: server.started)
+    try:
+        yield
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def hears_408(line: socket.socket) -> bool:
+    with line, line.makefile("rb") as stream:
+        return stream.read().startswith(b"HTTP/1.1 408 ")  # Until it is closed.
+
+
 def test_a_hundred_half_requests_are_closed_and_then_others_answered(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def answer(request: Request) -> PlainTextResponse:
         return PlainTextResponse(f"{len(await request.body())} bytes")
 
-    app = Starlette(routes=[Route("/", answer, methods=["GET", "POST"])])
-    server = uvicorn.Server(uvicorn.Config(app, http=Hasty, log_level="critical"))
     listener = socket.create_server(("127.0.0.1", 0), backlog=200)
     place = listener.getsockname()
     # All is sent before the server begins: what is sent to one that has hung up loses its answer.
     slow = [socket.create_connection(place, LIMIT_S) for _ in range(100)]
     for number, one in enumerate(slow):
         one.sendall((b"GET / HTTP/1.1\r\nHo", HEAD + b"x")[number % 2])
-    thread = threading.Thread(target=server.run, args=([listener],))
-    thread.start()
-    until(lambda: server.started)
-    try:
-        for one in slow:
-            with one, one.makefile("rb") as stream:
-                assert stream.read().startswith(b"HTTP/1.1 408 ")  # Until it is closed.
+    with serving(listener, Route("/", answer, methods=["GET", "POST"])):
+        assert all(hears_408(one) for one in slow)
         for part in ("head_s", "body_s"):
             monkeypatch.setattr(Hasty, part, LIMIT_S)
         with socket.create_connection(place, LIMIT_S) as good, good.makefile("rb") as stream:
             good.sendall(b"POST / HTTP/1.0\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc")
             assert stream.read().endswith(b"\r\n\r\n3 bytes")
-    finally:
-        server.should_exit = True
-        thread.join()
+
+
+def test_a_websocket_is_no_request_that_is_late(caplog: pytest.LogCaptureFixture) -> None:
+    async def echo(websocket: WebSocket) -> None:
+        await websocket.accept()
+        async for text in websocket.iter_text():
+            await websocket.send_text(text)
+
+    listener = socket.create_server(("127.0.0.1", 0))
+    place = listener.getsockname()
+    with (
+        serving(listener, WebSocketRoute("/", echo)),
+        connect(f"ws://127.0.0.1:{place[1]}/", proxy=None) as page,
+    ):
+        page.send("first")
+        assert page.recv(timeout=LIMIT_S) == "first"
+        # Whoever connects later and asks nothing is hung up on, so that the time is over.
+        assert hears_408(socket.create_connection(place, LIMIT_S))
+        page.send("second")
+        assert page.recv(timeout=LIMIT_S) == "second"
+    assert [record for record in caplog.records if record.name == "asyncio"] == []
