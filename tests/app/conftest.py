@@ -19,6 +19,17 @@ def fitted_folder(tmp_path_factory: pytest.TempPathFactory, sheet_folder: Path) 
     return fit_sheet(tmp_path_factory.mktemp("fits") / "fitted", sheet_folder).folder
 
 
+@pytest.fixture(scope="module")
+def still_world(
+    tmp_path_factory: pytest.TempPathFactory, sheet_folder: Path, fitted_folder: Path
+) -> World:
+    """A server like `world`, shared by those tests of a file that change nothing."""
+    folder = tmp_path_factory.mktemp("still")
+    shutil.copytree(sheet_folder, folder / "sequences" / "sheet")
+    shutil.copytree(fitted_folder, folder / "runs" / "fitted")
+    return make_world(folder)
+
+
 @pytest.fixture
 def data_dir(tmp_path: Path, sheet_folder: Path) -> Path:
     """A data folder with one small sequence and no run."""

@@ -69,8 +69,9 @@ def test_what_is_left_out_stays(client: TestClient) -> None:
     ],
 )
 def test_what_is_too_long_or_not_text_is_refused(
-    client: TestClient, changes: dict[str, Any], words: str
+    still_world: World, changes: dict[str, Any], words: str
 ) -> None:
+    client = still_world.script()
     before = client.get(ADDRESS).json()
     answer = client.patch(ADDRESS, json=changes)
     assert answer.status_code == 422

@@ -132,8 +132,8 @@ def test_profiles_are_listed(client: TestClient) -> None:
         ("DELETE", "/runs/nothing"),
     ],
 )
-def test_what_is_not_there_is_not_found(client: TestClient, method: str, path: str) -> None:
-    response = client.request(method, f"/api/v1{path}")
+def test_what_is_not_there_is_not_found(still_world: World, method: str, path: str) -> None:
+    response = still_world.script().request(method, f"/api/v1{path}")
     assert response.status_code == 404
     assert error_of(response)["code"] == "not_found"
     assert "'nothing'" in error_of(response)["message"]
@@ -142,7 +142,8 @@ def test_what_is_not_there_is_not_found(client: TestClient, method: str, path: s
 @pytest.mark.parametrize(
     "run_id", ["..%2f..%2fetc", "%2e%2e", "a.b", "C:x", "a" * 65, "%00", "%5c%5chost%5cs", "a%0ab"]
 )
-def test_an_id_is_never_a_path(client: TestClient, run_id: str) -> None:
+def test_an_id_is_never_a_path(still_world: World, run_id: str) -> None:
+    client = still_world.script()
     for method, rest in (("GET", ""), ("DELETE", ""), ("POST", "/cancel"), ("GET", "/events")):
         response = client.request(method, f"/api/v1/runs/{run_id}{rest}")
         assert response.status_code in {404, 405, 422}
@@ -196,8 +197,8 @@ def test_exports_read_back_as_what_the_run_holds(world: World) -> None:
     "query",
     ["", "format=pkl", "format=../ply", "format=npz&sequence=nowhere", "format=npz&sequence=../x"],
 )
-def test_what_cannot_be_exported_is_told(client: TestClient, query: str) -> None:
-    response = client.get(f"/api/v1/runs/fitted/export?{query}")
+def test_what_cannot_be_exported_is_told(still_world: World, query: str) -> None:
+    response = still_world.script().get(f"/api/v1/runs/fitted/export?{query}")
     assert response.status_code == 422
     assert error_of(response)["message"]
 

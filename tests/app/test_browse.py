@@ -206,8 +206,8 @@ def test_the_home_page_opens_what_came_with_it_and_says_whose_it_is(world: World
         ("offset=500", "This list ends before"),
     ],
 )
-def test_an_empty_list_says_why(world: World, query: str, text: str) -> None:
-    page = world.browser().get(f"/runs?{query}")
+def test_an_empty_list_says_why(still_world: World, query: str, text: str) -> None:
+    page = still_world.browser().get(f"/runs?{query}")
     assert page.status_code == 200
     assert text in page.text
     assert "<img src=x" not in page.text

@@ -14,9 +14,8 @@ HOSTILE = "<img src=x onerror=alert(1)>"
 LIFT = 0.004
 
 
-@pytest.fixture
-def pair(world: World) -> tuple[str, str]:
-    """The fitted run, and another one of which every node is 4 mm higher."""
+def lift(world: World) -> tuple[str, str]:
+    """Give a server another run, of which every node is 4 mm higher; returns both."""
     source = world.catalog.run("fitted")
     name = source.sequence_names[0]
     folder = world.settings.run_dir / "lifted"
@@ -31,6 +30,19 @@ def pair(world: World) -> tuple[str, str]:
         attempt.save_yaml("object/parameters.yaml", parameters)
         attempt.publish()
     return "fitted", run.id
+
+
+@pytest.fixture
+def pair(world: World) -> tuple[str, str]:
+    """The fitted run and the one that is lifted."""
+    return lift(world)
+
+
+@pytest.fixture(scope="module")
+def still_pair(still_world: World) -> World:
+    """A server with both runs, for tests that change nothing."""
+    lift(still_world)
+    return still_world
 
 
 def test_the_numbers_of_a_pair(world: World, pair: tuple[str, str]) -> None:
@@ -79,10 +91,10 @@ def test_the_page_shows_both_and_only_where_they_differ(
     ],
 )
 def test_a_wrong_address_names_the_field(
-    world: World, pair: tuple[str, str], query: str, status: int, word: str
+    still_pair: World, query: str, status: int, word: str
 ) -> None:
     for address in ("/compare", "/api/v1/comparison"):
-        answer = world.script().get(f"{address}?{query}")
+        answer = still_pair.script().get(f"{address}?{query}")
         assert answer.status_code == status
         assert word in answer.json()["error"]["message"]
 

@@ -127,8 +127,8 @@ def test_pages_run_no_foreign_and_no_inline_script(world: World) -> None:
         "/live/%2e%2e",
     ],
 )
-def test_no_path_leads_out(world: World, path: str) -> None:
-    response = world.browser().get(path)
+def test_no_path_leads_out(still_world: World, path: str) -> None:
+    response = still_world.browser().get(path)
     assert response.status_code == 404
     assert "root:" not in response.text
 

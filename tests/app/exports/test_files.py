@@ -172,13 +172,13 @@ def test_a_live_scene_gives_the_rollout_of_its_sliders(
     ],
 )
 def test_errors_name_the_field_in_the_shape_that_openapi_tells(
-    world: World, made: list[FileRequest], query: str, status: int, word: str
+    still_world: World, made: list[FileRequest], query: str, status: int, word: str
 ) -> None:
-    answer = world.script().get(f"{RUN}?{query}")
+    answer = still_world.script().get(f"{RUN}?{query}")
     assert answer.status_code == status
     assert word in answer.json()["error"]["message"]
     assert made == []
-    schema = world.script().get("/api/v1/openapi.json").json()
+    schema = still_world.script().get("/api/v1/openapi.json").json()
     told = schema["paths"]["/api/v1/runs/{run_id}/export"]["get"]["responses"][str(status)]
     shape = told["content"]["application/json"]["schema"] | {"components": schema["components"]}
     jsonschema.validate(answer.json(), shape)

@@ -81,14 +81,14 @@ def test_the_link_of_a_scene_opens_another_one_like_it(world: World) -> None:
     ],
 )
 def test_a_link_that_makes_no_sense_is_a_page_that_names_the_field(
-    world: World, query: str, field: str
+    still_world: World, query: str, field: str
 ) -> None:
-    answer = world.browser().get(f"/runs/fitted/view?{query}")
+    answer = still_world.browser().get(f"/runs/fitted/view?{query}")
     assert answer.status_code == 422
     assert "text/html" in answer.headers["content-type"]
     assert field in answer.text.split("<main", 1)[1]
     assert "<b>=" not in answer.text
-    assert world.sessions.list() == []
+    assert still_world.sessions.list() == []
 
 
 def test_a_page_elsewhere_opens_no_scene_but_may_ask_for_one(world: World) -> None:
