@@ -52,6 +52,7 @@ from app.jobs.views import (
     read_frame_errors,
 )
 from app.jobs.watch import Feed, Watch, preview_bytes
+from app.root_path import address_on
 from app.viewer.sessions import AnySession, Sessions
 from physhandi.fitting.config import named_profile, profile_names
 
@@ -629,7 +630,7 @@ def _add_sessions(router: APIRouter, sessions: Sessions) -> None:
         target = new.query if isinstance(new, NewComparison) else new.id
         may_keep = request.state.may_change
         session_id = sessions.open(new.kind, target, request.state.owner, may_keep=may_keep)
-        return {"id": session_id, "url": f"/live/{session_id}"}
+        return {"id": session_id, "url": address_on(request, f"/live/{session_id}")}
 
     def find(session_id: str, request: Request) -> AnySession:
         scene = sessions.find(session_id, request.state.owner)
@@ -640,7 +641,7 @@ def _add_sessions(router: APIRouter, sessions: Sessions) -> None:
     @router.get("/sessions/{session_id}")
     def show_session(session_id: ItemId, request: Request) -> dict[str, str]:
         find(session_id, request)
-        return {"id": session_id, "url": f"/live/{session_id}"}
+        return {"id": session_id, "url": address_on(request, f"/live/{session_id}")}
 
     @router.patch("/sessions/{session_id}", status_code=204)
     def change_session(session_id: ItemId, wishes: SessionWishes, request: Request) -> Response:

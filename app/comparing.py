@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 
 from app.comparison import CompareAsk
@@ -34,12 +34,13 @@ def create_comparing(catalog: Catalog, scheduler: Scheduler, pages: Pages) -> AP
     router = APIRouter()
 
     @router.get("/compare", include_in_schema=False)
-    def show_page(ask: Annotated[CompareAsk, Query()]) -> HTMLResponse:
+    def show_page(request: Request, ask: Annotated[CompareAsk, Query()]) -> HTMLResponse:
         items = [catalog.run_item(ask.a), catalog.run_item(ask.b)]
         first, second = (_opened(item) for item in items)
         shared = [name for name in first.sequence_names if name in second.sequence_names]
         described = [describe_run(item, scheduler) for item in items]
         return pages.render(
+            request,
             "compare.html",
             ask=ask.model_dump(),
             runs=described,
@@ -54,13 +55,14 @@ def create_comparing(catalog: Catalog, scheduler: Scheduler, pages: Pages) -> AP
         )
 
     @router.get("/runs/{run_id}/compare", include_in_schema=False)
-    def choose_other(run_id: ItemId) -> HTMLResponse:
+    def choose_other(request: Request, run_id: ItemId) -> HTMLResponse:
         """Offer the runs that one can be compared with, those of the same recordings first."""
         run = describe_run(catalog.run_item(run_id), scheduler)
         others = [describe_run(item, scheduler) for item in catalog.runs() if item.id != run_id]
         others = [other for other in others if other["is_published"]]
         shared = set(run["sequences"])
         return pages.render(
+            request,
             "compare_with.html",
             run=run,
             near=[other for other in others if shared & set(other["sequences"])],

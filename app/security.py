@@ -47,7 +47,7 @@ _LOOKING = tuple((method, re.compile(path)) for method, path in LOOKING)
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
-    "connect-src 'self'; font-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; "
+    "connect-src 'self'; font-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'self'; "
     "frame-ancestors 'self'"
 )
 # viser's page is one file with inline scripts, workers and WebAssembly.
@@ -80,10 +80,11 @@ _LOCKED = (
     # A browser that came from another site brings its cookie only when it is asked again from here.
     "<p>Did you just open that address? <a href=''>Try again</a></p>"
 )
-_READ_ONLY = (
+READ_ONLY = (
     "You may only look here. Open the server's full address, or ask who runs it, to launch, "
     "change, share or delete."
 )
+"""What who may only look is told."""
 PROBES = frozenset({"/healthz", "/readyz"})
 """What answers everybody, and tells nothing of anybody; see `app.health`."""
 SHARED = "/shared/"
@@ -133,6 +134,8 @@ class Security:
         self.cookie = f"physhandi_{settings.port if port is None else port}"
         """Name of the cookie; cookies do not know ports, so it tells servers of one host apart."""
         own = f"[{settings.host}]" if ":" in settings.host else settings.host.lower()
+        self.cookie_path = settings.root_path or "/"
+        """Path below which browsers send the cookie."""
         self._hosts = {"localhost", "127.0.0.1", "[::1]", own, *settings.allowed_hosts}
         self._any_host = not is_loopback(settings.host) and settings.host in {"0.0.0.0", "::"}  # noqa: S104
         self._lock = threading.Lock()
@@ -233,7 +236,7 @@ class Gatekeeper:
         if offered is None and not self._has_own_origin(scope, headers):
             return _error(403, "foreign_origin", "The request comes from another site.")
         if not visitor.may_change and not only_looks(scope):
-            return _error(403, "read_only", _READ_ONLY)
+            return _error(403, "read_only", READ_ONLY)
         state["owner"], state["may_change"] = visitor.name, visitor.may_change
         state["is_foreign"] = offered is None and _is_foreign(headers)
         return _without_token(scope)
@@ -264,7 +267,7 @@ class Gatekeeper:
                 made,
                 httponly=True,
                 samesite="strict",
-                path="/",
+                path=self._security.cookie_path,
                 secure=scope.get("scheme") == "https",
             )
             return response

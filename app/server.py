@@ -43,6 +43,7 @@ from app.jobs.views import describe_run
 from app.jobs.watch import Feed
 from app.pages import Pages, create_pages
 from app.previews.store import Previews
+from app.root_path import BelowRootPath
 from app.security import Gatekeeper, Security
 from app.settings import WEB_ASSETS, ServerSettings
 from app.slow_requests import ImpatientProtocol
@@ -131,10 +132,11 @@ def create_app(
             ],
         ),
         openapi_url="/api/v1/openapi.json",
+        servers=[{"url": settings.root_path}] if settings.root_path else None,
         docs_url=None,
         redoc_url=None,
     )
-    app.state.stopping = threading.Event()
+    app.state.root_path, app.state.stopping = settings.root_path, threading.Event()
     app.state.scheduler, app.state.sessions, app.state.security = scheduler, sessions, security
     models = ModelFolders(settings)
     overview = Overview(settings, catalog, scheduler, machine)
@@ -171,7 +173,14 @@ def create_app(
         )
     )
     app.include_router(
-        create_exports(catalog, sessions, pages, file_cache, Shares(settings.data_dir / "shares"))
+        create_exports(
+            catalog,
+            sessions,
+            pages,
+            file_cache,
+            Shares(settings.data_dir / "shares"),
+            root_path=settings.root_path,
+        )
     )
     app.include_router(create_comparing(catalog, scheduler, pages))
     app.include_router(create_gate(sessions))
@@ -181,7 +190,7 @@ def create_app(
         create_health(catalog, scheduler, sessions, machine, figures := CollectorRegistry())
     )
     _answer_errors(app, pages)
-    _guard(app, security, figures, audit_log)
+    _guard(app, security, figures, audit_log, root_path=settings.root_path)
     return app
 
 
@@ -211,13 +220,20 @@ def _storage(
 
 
 def _guard(
-    app: FastAPI, security: Security, registry: CollectorRegistry, audit_log: AuditLog
+    app: FastAPI,
+    security: Security,
+    registry: CollectorRegistry,
+    audit_log: AuditLog,
+    *,
+    root_path: str,
 ) -> None:
     """Put in front of all routes what requests have to pass; the last that is added comes first."""
     app.add_middleware(BodyLimit, most_bytes=_BODY_LIMIT)
     app.add_middleware(Gatekeeper, security=security)
     app.add_middleware(Audited, log=audit_log)
     app.add_middleware(RequestFigures, registry=registry)
+    if root_path:
+        app.add_middleware(BelowRootPath, root_path=root_path)
 
 
 def _answer_errors(app: FastAPI, pages: Pages) -> None:
@@ -230,7 +246,7 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
         if request.url.path.startswith("/api/") or not wants_page:
             error = {"code": code, "message": message} | ({"fields": fields} if fields else {})
             return JSONResponse({"error": error}, status_code=status)
-        return pages.error(status, message)
+        return pages.error(request, status, message)
 
     @app.exception_handler(PhysHandiError)
     @app.exception_handler(OSError)
@@ -322,9 +338,8 @@ def serve(
         queries = [
             f"?token={token}" for token in (security.token, security.read_only_token) if token
         ]
-        urls = [
-            f"http://{shown}:{port}/{query}" for query in ([""] if security.is_open else queries)
-        ]
+        home = f"http://{shown}:{port}{settings.root_path}/"
+        urls = [f"{home}{query}" for query in ([""] if security.is_open else queries)]
         _Server(config, app.state.stopping, lambda: on_ready(urls)).run(sockets=[listener])
     finally:
         listener.close()

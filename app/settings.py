@@ -35,6 +35,12 @@ def is_private(host: str) -> bool:
 
 LOCAL = "local"
 """The engine that runs fits on this machine."""
+OWN_PATHS = frozenset(
+    {"api", "assets", "compare", "diff", "healthz", "import", "launch", "live", "metrics", "readyz"}
+    | {"recovery", "runs", "sequences", "shared", "suites", "system", "viewer"}
+)
+"""With what the addresses of the application begin."""
+_ROOT_PATH = re.compile(r"(/(?!\.{1,2}(?:/|$))[A-Za-z0-9._~-]+)*")
 _CLUSTER = re.compile(r"ray://([A-Za-z0-9.-]+|\[[0-9A-Fa-f:]+\]):([0-9]{1,5})")
 
 
@@ -52,6 +58,8 @@ class ServerSettings(BaseSettings):
     """Address to listen on."""
     port: int = Field(default=8080, ge=0, le=65535)
     """Port to listen on; 0 takes a free one."""
+    root_path: str = ""
+    """Path below which a reverse proxy serves the application, such as ``/physhandi``."""
     device: str = "cpu"
     """Warp devices of fits, separated by commas; the first one also runs the live simulation."""
     auth: bool = True
@@ -151,6 +159,22 @@ class ServerSettings(BaseSettings):
         if isinstance(value, str):
             return tuple(part.strip().lower() for part in value.split(",") if part.strip())
         return value
+
+    @field_validator("root_path")
+    @classmethod
+    def _is_root_path(cls, value: str) -> str:
+        path = value.rstrip("/")
+        if _ROOT_PATH.fullmatch(path) is None:
+            raise ValueError(
+                f"{value!r} is no path below which it could be served; give one such as /physhandi "
+                "(letters, digits, and . _ ~ - within its parts)"
+            )
+        if (first := path[1:].partition("/")[0]) in OWN_PATHS:
+            raise ValueError(
+                f"{value!r} cannot be told from the application's own addresses, which begin with "
+                f"/{first}, too; choose another path"
+            )
+        return path
 
     @field_validator("engine")
     @classmethod

@@ -31,6 +31,7 @@ class Scene:
     target: str
     title: str
     offers: tuple[str, ...] = ("object", "colors", "figure")
+    reason: str = ""
 
     @property
     def info(self) -> "Scene":

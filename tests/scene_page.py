@@ -22,7 +22,7 @@ window.cancelAnimationFrame = (number) => clearTimeout(number);
 Software draws them, which is much of what these tests cost. `physhandi benchmark viewer` measures
 how many a browser gets."""
 COARSER_PICTURES = """
-if (location.pathname.startsWith("/viewer/"))
+if (location.pathname.includes("/viewer/"))
   Object.defineProperty(window, "devicePixelRatio", { get: () => 0.5 });
 """
 """Scenes are drawn with a quarter of their pixels and stretched; files of pictures keep theirs."""
@@ -31,7 +31,7 @@ LESS_DRAWING = ("--disable-gpu-compositing", "--webgl-msaa-sample-count=0")
 _SENT = "() => new Promise((done) => setTimeout(done, 60))"
 """viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
 _PICTURE = "() => new Promise((done) => requestAnimationFrame(done))"
-_SESSION = "document.getElementById('scene').contentWindow.location.pathname.split('/')[2]"
+_SESSION = "document.getElementById('scene').contentWindow.location.pathname.split('/').at(-2)"
 
 
 class ScenePage:
@@ -140,7 +140,7 @@ class ScenePage:
     def link(self) -> dict[str, str]:
         """What the server shows, as its link tells it; a field holds at once what is typed."""
         session = self.page.evaluate(_SESSION)
-        address = urljoin(self.page.url, f"/api/v1/sessions/{session}/link")
+        address = urljoin(self.page.evaluate("document.baseURI"), f"api/v1/sessions/{session}/link")
         return dict(parse_qsl(self.page.request.get(address).json()["query"]))
 
     def frame(self) -> int:

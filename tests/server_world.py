@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from fastapi import FastAPI
 from pydantic import SecretStr
@@ -51,8 +52,10 @@ class World:
         return client
 
 
-def make_world(data_dir: Path, *, bundled: Path = BUNDLED) -> World:
-    settings = ServerSettings(data_dir=data_dir, token=SecretStr(TOKEN), cancel_grace_s=1.0)
+def make_world(data_dir: Path, *, bundled: Path = BUNDLED, **changes: Any) -> World:
+    settings = ServerSettings(
+        data_dir=data_dir, token=SecretStr(TOKEN), cancel_grace_s=1.0, **changes
+    )
     security = Security(settings)
     catalog = Catalog(settings, bundled=bundled)
     scheduler = Scheduler(settings, catalog, worker="job_worker")

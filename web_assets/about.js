@@ -16,7 +16,7 @@ function edit(isOn) {
 
 async function saveAbout() {
   const { name, tags, note } = aboutForm.elements;
-  const run = await send("PATCH", `/api/v1/runs/${aboutForm.dataset.run}`, {
+  const run = await send("PATCH", `api/v1/runs/${aboutForm.dataset.run}`, {
     name: name.value, tags: tags.value.split(/[\s,]+/).filter(Boolean), note: note.value,
   });
   // What was saved is what the form begins with the next time.

@@ -46,7 +46,7 @@ const refresh = (id) => {
 /* ---- what buttons do ---- */
 
 async function openScene(button) {
-  const session = await send("POST", "/api/v1/sessions", { kind: button.dataset.open, id: button.dataset.id });
+  const session = await send("POST", "api/v1/sessions", { kind: button.dataset.open, id: button.dataset.id });
   location.href = session.url;
 }
 
@@ -93,17 +93,17 @@ async function copyText(text, inside = window) {
 async function shareView(run, query) {
   const fields = new URLSearchParams(query);
   fields.set("format", "html");
-  await makeSlowFile(`/api/v1/runs/${run}/export?${fields}`, "Making the page that is shared");
-  const share = await send("POST", `/api/v1/runs/${run}/shares?${query}`);
-  if (await copyText(new URL(share.url, location.href).href)) {
-    toast("Link copied: whoever has it sees this replay, and nothing else, until you withdraw it.", false, { href: `/runs/${run}#shares`, textContent: "Shared pages" });
+  await makeSlowFile(`api/v1/runs/${run}/export?${fields}`, "Making the page that is shared");
+  const share = await send("POST", `api/v1/runs/${run}/shares?${query}`);
+  if (await copyText(new URL(share.url, document.baseURI).href)) {
+    toast("Link copied: whoever has it sees this replay, and nothing else, until you withdraw it.", false, { href: `runs/${run}#shares`, textContent: "Shared pages" });
   }
   dispatchEvent(new Event("shares-changed"));
 }
 
 async function act(button) {
   const body = "afresh" in button.dataset ? { afresh: true } : undefined;
-  await send("POST", `/api/v1/runs/${button.dataset.id}/${button.dataset.act}`, body);
+  await send("POST", `api/v1/runs/${button.dataset.id}/${button.dataset.act}`, body);
   toast(button.dataset.act === "cancel" ? "Cancelling …" : "Back in line");
   refresh("runs");
   dispatchEvent(new Event("run-changed"));
@@ -111,14 +111,14 @@ async function act(button) {
 
 async function removeExpendable() {
   if (!confirm("Remove everything that is listed? It cannot be brought back.")) return;
-  const { removed, bytes } = await send("POST", "/api/v1/retention");
+  const { removed, bytes } = await send("POST", "api/v1/retention");
   toast(`${removed.length} removed, ${(bytes / 1048576).toFixed(1)} MiB`);
   location.reload();
 }
 
 async function setPriority(button) {
   const { id, priority } = button.dataset;
-  const { place } = await send("POST", `/api/v1/runs/${id}/priority`, { priority });
+  const { place } = await send("POST", `api/v1/runs/${id}/priority`, { priority });
   toast(`${priority[0].toUpperCase()}${priority.slice(1)} priority${place ? `: no. ${place} in line` : ""}`);
   refresh("runs");
   dispatchEvent(new Event("run-changed"));
@@ -128,16 +128,16 @@ async function setPriority(button) {
 async function moveAside(button) {
   const { aside, id, name } = button.dataset;
   if (!confirm(`Move the folder of “${name}” to damaged/${aside} of the data folder? Nothing is deleted.`)) return;
-  const { moved_to } = await send("POST", `/api/v1/${aside}/${id}/aside`);
+  const { moved_to } = await send("POST", `api/v1/${aside}/${id}/aside`);
   toast(`Moved to ${moved_to}`);
-  if (document.getElementById("run")) location.href = "/recovery";
+  if (document.getElementById("run")) location.href = "recovery";
   else location.reload();
 }
 
 async function remove(button) {
   if (!confirm(`Delete “${button.dataset.name}” with all its results?`)) return;
-  await send("DELETE", `/api/v1/runs/${button.dataset.delete}`);
-  if (document.getElementById("run")) location.href = "/";
+  await send("DELETE", `api/v1/runs/${button.dataset.delete}`);
+  if (document.getElementById("run")) location.href = ".";
   else refresh("runs");
 }
 
@@ -155,7 +155,7 @@ async function askReadiness(dialog) {
   if (!sequence) return;
   const place = dialog.querySelector("[data-readiness]");
   place.hidden = true;
-  const answer = await send("POST", "/api/v1/runs/check", { sequences: [sequence] }).catch(() => null);
+  const answer = await send("POST", "api/v1/runs/check", { sequences: [sequence] }).catch(() => null);
   if (dialog.querySelector("[name=sequence]").value === sequence) showReadiness(place, answer, [sequence]);
 }
 
@@ -165,7 +165,7 @@ function showReadiness(place, answer, sequences) {
   place.hidden = !stages.length;
   const skipped = stages.filter(([, stage]) => !stage.ready);
   const summary = place.querySelector("[data-summary]");
-  const link = (id) => Object.assign(document.createElement("a"), { href: `/sequences/${id}/check`, textContent: sequences.length > 1 ? `check ${id}` : "check the recording" });
+  const link = (id) => Object.assign(document.createElement("a"), { href: `sequences/${id}/check`, textContent: sequences.length > 1 ? `check ${id}` : "check the recording" });
   summary.className = answer?.nothing_to_fit ? "problem" : answer?.skips_object ? "doubt" : "dim";
   summary.textContent = answer?.nothing_to_fit ?? answer?.skips_object ?? (skipped.length ? "These stages have nothing to do; the others will run:" : "All stages will run.");
   for (const id of sequences) summary.append(" ", link(id));
@@ -188,7 +188,7 @@ function showReadiness(place, answer, sequences) {
 
 async function launch(form) {
   const fields = new FormData(form);
-  const run = await send("POST", "/api/v1/runs", {
+  const run = await send("POST", "api/v1/runs", {
     sequences: [fields.get("sequence")],
     profile: fields.get("profile"),
     name: fields.get("name"),
@@ -197,11 +197,11 @@ async function launch(form) {
   });
   form.closest("dialog").close();
   form.reset();
-  toast(`“${run.name}” is in line`, false, { href: `/runs/${run.id}`, textContent: "Watch it" });
+  toast(`“${run.name}” is in line`, false, { href: `runs/${run.id}`, textContent: "Watch it" });
   refresh("runs");
   const heading = document.getElementById("runs-heading");
   if (heading) heading.scrollIntoView({ behavior: "smooth" });
-  else location.href = "/runs";
+  else location.href = "runs";
 }
 
 document.addEventListener("click", (event) => {
@@ -226,6 +226,14 @@ document.addEventListener("click", (event) => {
   else if ("close" in data) button.closest("dialog").close();
 });
 
+/* Addresses of a page are relative to its base; a place on the page is not. */
+document.addEventListener("click", (event) => {
+  const link = event.target.closest("a[href^='#']");
+  if (!link || event.defaultPrevented) return;
+  event.preventDefault();
+  if (link.hash) location.hash = link.hash;
+});
+
 document.addEventListener("change", (event) => {
   if (event.target.matches("#launch [name=sequence]")) askReadiness(event.target.closest("dialog"));
 });
@@ -241,7 +249,7 @@ document.addEventListener("keydown", (event) => {
   const help = document.getElementById("help");
   if (event.key === "?") help.open ? help.close() : help.showModal();
   else if (document.querySelector("dialog[open]")) return;
-  else if (event.key === "h") location.href = "/";
+  else if (event.key === "h") location.href = ".";
   else if (event.key === "/" && document.querySelector("[data-filter]")) {
     event.preventDefault();
     document.querySelector("[data-filter]").select();
@@ -303,7 +311,7 @@ let cursor = null;
 
 function follow() {
   if (stream || document.hidden || !cursor) return;
-  const address = document.body.dataset.stream ?? "/api/v1/events";
+  const address = document.body.dataset.stream ?? "api/v1/events";
   stream = new EventSource(`${address}?since=${encodeURIComponent(cursor)}`);
   for (const name of Object.keys(listeners)) {
     stream.addEventListener(name, (event) => {

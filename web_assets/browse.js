@@ -22,7 +22,7 @@ function showChosen() {
     : `Choose 2 to ${MOST_CHOSEN} runs to compare them.`;
   part("diff").disabled = !isEnough;
   part("scene").hidden = chosen.size !== 2;
-  if (chosen.size === 2) part("scene").href = `/compare?${new URLSearchParams({ a: first, b: second })}`;
+  if (chosen.size === 2) part("scene").href = `compare?${new URLSearchParams({ a: first, b: second })}`;
   part("clear").hidden = chosen.size === 0;
   sessionStorage.setItem(STORE, JSON.stringify([...chosen]));
 }
@@ -45,7 +45,7 @@ document.addEventListener("click", (event) => {
 document.addEventListener("submit", (event) => {
   if (event.target.id !== "diff") return;
   event.preventDefault(); // Runs that are chosen on another page of the list count too.
-  location.href = `/diff?${new URLSearchParams([...chosen].map((id) => ["run", id]))}`;
+  location.href = `diff?${new URLSearchParams([...chosen].map((id) => ["run", id]))}`;
 });
 
 /* ---- pictures that are still being made appear as soon as they are there ---- */

@@ -61,7 +61,7 @@
     const key = keyOf(figure);
     if (!loaded.has(key)) {
       const [view, frame] = key.split("/");
-      const mask = await send("GET", `/api/v1/sequences/${frames.dataset.sequence}/views/${view}/frames/${frame}/mask`).catch((error) => toast(error.message, true));
+      const mask = await send("GET", `api/v1/sequences/${frames.dataset.sequence}/views/${view}/frames/${frame}/mask`).catch((error) => toast(error.message, true));
       if (mask && !loaded.has(key)) loaded.set(key, expand(mask.runs));
     }
     if (isOn() && key === keyOf(figure)) paint(figure);
@@ -135,7 +135,7 @@
       const [view, frame] = key.split("/");
       return { view, frame: Number(frame), runs: pack(loaded.get(key)) };
     });
-    const job = await send("POST", `/api/v1/sequences/${frames.dataset.sequence}/correction`, { masks, carry_on: tool("carry").checked });
+    const job = await send("POST", `api/v1/sequences/${frames.dataset.sequence}/correction`, { masks, carry_on: tool("carry").checked });
     isLeaving = true;
     followAnnotation(job);
   }

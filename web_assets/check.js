@@ -12,7 +12,7 @@ function address(view, frame) {
   const isPainted = (layer) => layer === "mask" && frames.classList.contains("is-brushing");
   const layers = [...frames.querySelectorAll("[name=layer]:checked")].map((box) => box.value).filter((layer) => !isPainted(layer)).join(",");
   const depth = frames.querySelector("[data-depth]")?.checked ? "&depth=true" : "";
-  return `/sequences/${frames.dataset.sequence}/views/${view}/frames/${frame}?layers=${layers}${depth}&v=${frames.dataset.version}`;
+  return `sequences/${frames.dataset.sequence}/views/${view}/frames/${frame}?layers=${layers}${depth}&v=${frames.dataset.version}`;
 }
 
 /** Show what the slider says; a picture that is still coming is not interrupted, the latest one is. */
@@ -178,7 +178,7 @@ function showPicks(shown = picks) {
 /** The network that finds masks or tracks in the place of what is built in; empty for none. */
 const chosen = (finds) => annotation.querySelector(`[data-model=${finds}]`)?.value ?? "";
 
-const own = () => `/api/v1/sequences/${annotation.dataset.sequence}/annotation`;
+const own = () => `api/v1/sequences/${annotation.dataset.sequence}/annotation`;
 
 /** Follow the work until it ends; what was found is then shown by the page itself. */
 function followAnnotation(job, was) {

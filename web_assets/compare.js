@@ -13,7 +13,7 @@
   let session = null;
 
   const given = (fields) => Object.fromEntries(Object.entries(fields).filter(([, value]) => value !== null));
-  const wish = (wishes) => send("PATCH", `/api/v1/sessions/${session}`, wishes).catch((error) => toast(error.message, true));
+  const wish = (wishes) => send("PATCH", `api/v1/sessions/${session}`, wishes).catch((error) => toast(error.message, true));
   const dress = () => session && wish({ dark: isDark.matches });
 
   /* A page that is loaded again goes on with its scene, if that still shows these runs. */
@@ -21,25 +21,25 @@
     if (performance.getEntriesByType("navigation")[0]?.type === "navigate") return null;
     const kept = JSON.parse(sessionStorage.getItem(STORE) ?? "null");
     if (!kept || kept.pair !== JSON.stringify([ask.a, ask.b, ask.sequence])) return null;
-    return send("GET", `/api/v1/sessions/${kept.session}`).then(() => kept.session, () => null);
+    return send("GET", `api/v1/sessions/${kept.session}`).then(() => kept.session, () => null);
   }
 
   async function open() {
     try {
-      session = (await known()) ?? (await send("POST", "/api/v1/sessions", { kind: "comparison", ...given(ask) })).id;
+      session = (await known()) ?? (await send("POST", "api/v1/sessions", { kind: "comparison", ...given(ask) })).id;
     } catch (error) {
       waiting.removeAttribute("aria-busy");
       waiting.textContent = error.message;
       waiting.className = "waiting problem";
       return;
     }
-    scene.src = `/viewer/${session}/`;
+    scene.src = `viewer/${session}/`;
     scene.hidden = false;
   }
 
   /* A scene that another tab shows already is copied by the server, which sends the frame on. */
   function settle() {
-    const shown = /^\/viewer\/([\w-]+)\/$/.exec(scene.contentWindow.location.pathname)?.[1];
+    const shown = /\/viewer\/([\w-]+)\/$/.exec(scene.contentWindow.location.pathname)?.[1];
     if (!shown) return;
     session = shown;
     sessionStorage.setItem(STORE, JSON.stringify({ session, pair: JSON.stringify([ask.a, ask.b, ask.sequence]) }));
@@ -50,10 +50,10 @@
     scene.contentWindow.focus({ preventScroll: true });
   }
 
-  const link = () => send("GET", `/api/v1/sessions/${session}/link`);
+  const link = () => send("GET", `api/v1/sessions/${session}/link`);
 
   async function copyLink() {
-    const address = new URL((await link()).url, location.href).href;
+    const address = new URL((await link()).url, document.baseURI).href;
     const inside = document.activeElement === scene ? scene.contentWindow : window;
     if (await copyText(address, inside)) toast("Link copied: it opens this comparison as you see it now.");
   }
@@ -67,7 +67,7 @@
   /* The address bar follows what is seen; a scene that was closed says so. */
   async function follow() {
     if (document.hidden || !session) return;
-    const answer = await fetch(`/api/v1/sessions/${session}/link`).catch(() => null);
+    const answer = await fetch(`api/v1/sessions/${session}/link`).catch(() => null);
     if (answer?.ok) history.replaceState(null, "", (await answer.json()).url + location.hash);
     else if (answer && !scene.hidden) {
       scene.hidden = true;
@@ -100,7 +100,7 @@
 
   async function loadNumbers() {
     const query = new URLSearchParams(given({ a: ask.a, b: ask.b, sequence: ask.sequence }));
-    const numbers = await send("GET", `/api/v1/comparison?${query}`);
+    const numbers = await send("GET", `api/v1/comparison?${query}`);
     const part = document.querySelector("[data-per-frame]");
     const charts = part.querySelector(".charts");
     const notes = part.querySelector("[data-notes]");
@@ -123,7 +123,7 @@
   /* ---- start ---- */
 
   function go(changes) {
-    location.href = `/compare?${new URLSearchParams(given({ ...ask, f: 0, ...changes }))}`;
+    location.href = `compare?${new URLSearchParams(given({ ...ask, f: 0, ...changes }))}`;
   }
 
   forwardKeys(scene);

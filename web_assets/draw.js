@@ -71,7 +71,7 @@
       /* A lasso that was not drawn is a click. */
       const isDab = draws === "lasso" && points.length < 3;
       const shape = { tool: isDab ? "brush" : draws, way, points: points.map((point) => placeOf(point, box)), radius: (isDab ? DAB_PIXELS : radius) / box.height };
-      await fetch(`/viewer/${session}/shape`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(shape) });
+      await fetch(`viewer/${session}/shape`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(shape) });
     }
 
     root.addEventListener("pointerdown", begin, true);

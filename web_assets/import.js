@@ -43,8 +43,8 @@ document.addEventListener("submit", (event) => {
   const form = event.target;
   busy(form.querySelector("[type=submit]"), async () => {
     const order = orderOf(form);
-    const job = await send("POST", "/api/v1/imports", order);
-    await watch(form, `/api/v1/imports/${order.name}`, () => (location.href = `/sequences/${order.name}/check`), job);
+    const job = await send("POST", "api/v1/imports", order);
+    await watch(form, `api/v1/imports/${order.name}`, () => (location.href = `sequences/${order.name}/check`), job);
   });
 });
 
@@ -63,8 +63,8 @@ document.addEventListener("htmx:responseError", ({ detail }) => {
 
 const example = document.getElementById("example");
 if (example) {
-  const choose = () => (location.href = `/import?folder=${encodeURIComponent(example.dataset.place)}`);
-  const address = "/api/v1/captures/example";
+  const choose = () => (location.href = `import?folder=${encodeURIComponent(example.dataset.place)}`);
+  const address = "api/v1/captures/example";
   example.querySelector("[data-example]").addEventListener("click", ({ target }) => {
     if ("there" in example.dataset) choose();
     else busy(target, async () => watch(example, address, choose, await send("POST", address)));

@@ -137,7 +137,7 @@ function complain(problems, message) {
 async function check() {
   const number = ++asked;
   const wanted = draft();
-  const answer = await send("POST", "/api/v1/runs/check", wanted).catch((error) => ({ problems: [], message: error.message }));
+  const answer = await send("POST", "api/v1/runs/check", wanted).catch((error) => ({ problems: [], message: error.message }));
   if (number !== asked) return;
   const { problems, expected, message } = answer;
   complain(problems, message);
@@ -154,7 +154,7 @@ function onChange() {
 
 async function submit() {
   const accept = order.querySelector("[name=accepts_missing]");
-  const response = await fetch("/api/v1/runs", {
+  const response = await fetch("api/v1/runs", {
     method: "POST",
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify({ ...draft(), name: order.querySelector("[name=name]").value, parent: order.dataset.parent ?? null, accepts_missing: accept.checked, priority: order.querySelector("[name=priority]").value }),
@@ -162,7 +162,7 @@ async function submit() {
     throw new Error("The server does not answer. Is it still running?");
   });
   const answer = await response.json();
-  if (response.ok) location.href = `/runs/${answer.id}`;
+  if (response.ok) location.href = `runs/${answer.id}`;
   else complain(answer.error.fields, answer.error.message);
 }
 

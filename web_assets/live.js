@@ -11,21 +11,21 @@
   const isDark = matchMedia("(prefers-color-scheme: dark)");
   let session = scene.dataset.session;
 
-  const wish = () => send("PATCH", `/api/v1/sessions/${session}`, { dark: isDark.matches }).catch(() => {});
+  const wish = () => send("PATCH", `api/v1/sessions/${session}`, { dark: isDark.matches }).catch(() => {});
 
-  const seek = (frame) => send("PATCH", `/api/v1/sessions/${session}`, { frame }).catch((error) => toast(error.message, true));
+  const seek = (frame) => send("PATCH", `api/v1/sessions/${session}`, { frame }).catch((error) => toast(error.message, true));
 
   /* A scene that another tab shows already is copied by the server, which sends the frame on. */
   function settle() {
-    const shown = /^\/viewer\/([\w-]+)\/$/.exec(scene.contentWindow.location.pathname)?.[1];
+    const shown = /\/viewer\/([\w-]+)\/$/.exec(scene.contentWindow.location.pathname)?.[1];
     if (!shown) return;
     if (shown !== session) {
       session = shown;
-      history.replaceState(null, "", `/live/${shown}`);
+      history.replaceState(null, "", `live/${shown}`);
       toast("Another tab shows this scene too. This tab has a copy of its own now.");
     }
     for (const entry of document.querySelectorAll("[data-session-export]")) {
-      entry.href = `/api/v1/sessions/${session}/export?format=${entry.dataset.sessionExport}`;
+      entry.href = `api/v1/sessions/${session}/export?format=${entry.dataset.sessionExport}`;
     }
     scene.contentWindow.addEventListener("keydown", onKey);
     wireScene(scene, seek);
@@ -39,7 +39,7 @@
 
   /* Refused where an address would show something else. */
   async function wholeLink() {
-    const link = await send("GET", `/api/v1/sessions/${session}/link`);
+    const link = await send("GET", `api/v1/sessions/${session}/link`);
     if (link.lost) throw new Error(link.lost);
     return link;
   }
@@ -47,7 +47,7 @@
   /* The link restores frame, camera, layers and parameters; the address bar follows it. */
   async function copyLink() {
     const link = await wholeLink();
-    const address = new URL(link.url, location.href).href;
+    const address = new URL(link.url, document.baseURI).href;
     const inside = document.activeElement === scene ? scene.contentWindow : window;
     if (await copyText(address, inside)) toast("Link copied: it opens this run as you see it now.");
   }
@@ -55,10 +55,9 @@
   /* What the link restores is filmed: parameters, layers and camera as they are now, or the camera's path. */
   async function film(entry) {
     const link = await wholeLink();
-    const address = link.url.replace(/^\/runs\/([^/]+)\/view\??/, "/api/v1/runs/$1/export?");
-    const query = new URLSearchParams(entry.dataset.sessionFilm);
+        const query = new URLSearchParams(entry.dataset.sessionFilm);
     if (link.camera_path && !query.has("turn")) query.set("camera_path", link.camera_path);
-    await fetchSlowFile(`${address}${address.endsWith("?") ? "" : "&"}${query}`, "Filming");
+    await fetchSlowFile(`api/v1/runs/${scene.dataset.target}/export?${link.query}${link.query && "&"}${query}`, "Filming");
   }
 
   async function share(entry) {
@@ -84,15 +83,15 @@
 
   async function follow() {
     if (document.hidden) return;
-    const link = await send("GET", `/api/v1/sessions/${session}/link`).catch(() => null);
-    const address = link && `/live/${session}?${link.query}`;
-    if (address && address !== location.pathname + location.search) history.replaceState(null, "", address);
+    const link = await send("GET", `api/v1/sessions/${session}/link`).catch(() => null);
+    const address = link && `live/${session}?${link.query}`;
+    if (address && new URL(address, document.baseURI).href !== location.href) history.replaceState(null, "", address);
   }
 
   /* A closed scene says so, and why: the server renders that page at the same address. */
   async function watch() {
     if (document.hidden) return;
-    const answer = await fetch(`/api/v1/sessions/${session}`).catch(() => null);
+    const answer = await fetch(`api/v1/sessions/${session}`).catch(() => null);
     if (answer && (answer.status === 404 || answer.status === 401)) location.reload();
   }
 

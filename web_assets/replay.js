@@ -18,7 +18,7 @@
     frame.id = "scene";
     frame.title = `Replay of ${document.title}`;
     frame.allow = "fullscreen";
-    frame.src = `/viewer/replay/?${query}`;
+    frame.src = `viewer/replay/?${query}`;
     frame.addEventListener("load", () => frame.contentWindow.focus());
     place.replaceChildren(frame);
     const link = document.querySelector("[data-replay-file]");

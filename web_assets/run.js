@@ -48,7 +48,7 @@ async function refreshParts() {
   try {
     while (isStale) {
       isStale = false;
-      const response = await fetch(`/runs/${page.run}/parts`, { headers: { Accept: "text/html" } });
+      const response = await fetch(`runs/${page.run}/parts`, { headers: { Accept: "text/html" } });
       if (!response.ok) throw new Error(`The server answered ${response.status}.`);
       const fresh = new DOMParser().parseFromString(await response.text(), "text/html");
       showLocalTimes(fresh);
@@ -224,7 +224,7 @@ function onGone() {
   unfollow();
   cursor = null;
   toast("This run was deleted.", true);
-  setTimeout(() => (location.href = "/"), 2500);
+  setTimeout(() => (location.href = "."), 2500);
 }
 
 async function begin() {
@@ -236,7 +236,7 @@ async function begin() {
   listeners.log = (part) => page.log.add(part);
   listeners.gone = onGone;
   listeners.load = onLoad;
-  page.preview = new Preview(page.now.querySelector(".preview"), `/api/v1/runs/${page.run}/preview`);
+  page.preview = new Preview(page.now.querySelector(".preview"), `api/v1/runs/${page.run}/preview`);
   listeners.preview = ({ number }) => page.preview.load(number);
   let seq = -1;
   try {

@@ -12,7 +12,7 @@
   };
 
   function row(share) {
-    const address = new URL(share.url, location.href).href;
+    const address = new URL(share.url, document.baseURI).href;
     const line = document.createElement("li");
     const link = Object.assign(document.createElement("a"), { href: share.url, target: "_blank", rel: "noreferrer", textContent: share.query ? "A view of the viewer" : "Replay" });
     const when = Object.assign(document.createElement("time"), { dateTime: share.created, textContent: new Date(share.created).toLocaleString("en", { dateStyle: "medium", timeStyle: "short" }) });
@@ -23,17 +23,17 @@
       button("Copy link", "Copy the address", async () => {
         if (await copyText(address)) toast("Link copied.");
       }),
-      button("Withdraw", "The link shows nothing any more", async () => {
-        await send("DELETE", `/api/v1/shares/${share.id}`);
+      ...("mayWithdraw" in section.dataset ? [button("Withdraw", "The link shows nothing any more", async () => {
+        await send("DELETE", `api/v1/shares/${share.id}`);
         toast("Withdrawn: the link shows nothing any more.");
         await list();
-      }),
+      })] : []),
     );
     return line;
   }
 
   async function list() {
-    const shares = await send("GET", `/api/v1/shares?run=${section.dataset.run}`);
+    const shares = await send("GET", `api/v1/shares?run=${section.dataset.run}`);
     section.hidden = !shares.length;
     section.querySelector("ul").replaceChildren(...shares.map(row));
   }

@@ -51,7 +51,7 @@
     }
 
     function connect() {
-      socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/viewer/${session}/keys`);
+      socket = new WebSocket(new URL(`viewer/${session}/keys`, document.baseURI).href.replace(/^http/, "ws"));
       socket.addEventListener("message", (event) => {
         const told = JSON.parse(event.data);
         if (told.error) {

@@ -9,10 +9,13 @@ function cell(...content) {
 }
 
 function runLink(run) {
-  const link = Object.assign(document.createElement("a"), { href: `/runs/${run.id}`, textContent: run.name });
+  const link = Object.assign(document.createElement("a"), { href: `runs/${run.id}`, textContent: run.name });
   const small = Object.assign(document.createElement("div"), { className: "dim small", textContent: `${run.sequences.join(", ")} · ${run.profile || run.kind}` });
   return [link, small];
 }
+
+/** Make a cell of buttons, for who may do more than look. */
+const actionCell = (...buttons) => cell(...(document.querySelector("[data-only-looks]") ? [] : buttons));
 
 function cancelButton(run) {
   const button = Object.assign(document.createElement("button"), { className: "secondary outline", textContent: "Cancel" });
@@ -73,11 +76,11 @@ function showSystem({ machine, slots, running, waiting }) {
     if (estimate) left.title = `Estimated ${estimate.basis}`;
     const cells = [cell(...runLink(run)), cell(stage), left, numberCell(load ? load.processors.toFixed(1) : "–"), numberCell(bytes(load?.memory))];
     if (hasCard) cells.push(numberCell(bytes(load?.card_memory)));
-    return [...cells, cell(cancelButton(run))];
+    return [...cells, actionCell(cancelButton(run))];
   });
   fill(document.getElementById("waiting"), waiting, (run) => [
     cell(run.place ? `No. ${run.place}` : "–"), cell(...runLink(run)), cell(run.priority ?? "normal"), cell(run.reason),
-    cell(run.estimate ? `in ${about(run.estimate.starts_in_s)}` : "–"), cell(...urgencyButtons(run), cancelButton(run)),
+    cell(run.estimate ? `in ${about(run.estimate.starts_in_s)}` : "–"), actionCell(...urgencyButtons(run), cancelButton(run)),
   ]);
 }
 

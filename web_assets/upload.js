@@ -8,7 +8,7 @@
   const at = (name) => box.querySelector(`[data-${name}]`);
   const RETRY_MS = 2000;
   const POLL_MS = 400;
-  const KINDS = { captures: (name) => `/import?folder=${encodeURIComponent(`captures/${name}`)}`, sequences: (name) => `/sequences/${name}/check`, runs: (name) => `/runs/${name}` };
+  const KINDS = { captures: (name) => `import?folder=${encodeURIComponent(`captures/${name}`)}`, sequences: (name) => `sequences/${name}/check`, runs: (name) => `runs/${name}` };
   let isPaused = false;
   let isBusy = false;
 
@@ -49,23 +49,23 @@
   async function begin(files) {
     const listed = files.map(({ path, file }) => ({ path, size: file.size }));
     const key = (all) => JSON.stringify(all.map(({ path, size }) => [path, size]).sort());
-    const { uploads } = await send("GET", "/api/v1/uploads");
+    const { uploads } = await send("GET", "api/v1/uploads");
     const same = uploads.find((one) => key(one.files) === key(listed));
     if (same) return same;
     const name = nameOf(files);
-    return send("POST", "/api/v1/uploads", { name, files: listed });
+    return send("POST", "api/v1/uploads", { name, files: listed });
   }
 
   /** Send a piece; a server that does not answer is asked again until it does. */
   async function sendPiece(upload, number, offset, piece) {
     for (;;) {
       if (isPaused) return null;
-      const answer = await fetch(`/api/v1/uploads/${upload.id}/files/${number}?offset=${offset}`, { method: "PUT", body: piece }).catch(() => null);
+      const answer = await fetch(`api/v1/uploads/${upload.id}/files/${number}?offset=${offset}`, { method: "PUT", body: piece }).catch(() => null);
       if (answer?.ok) return (await answer.json()).received;
       if (answer) {
         const told = await answer.json().catch(() => null);
         // It may have taken the piece before the connection broke.
-        const now = answer.status === 409 ? await send("GET", `/api/v1/uploads/${upload.id}`) : null;
+        const now = answer.status === 409 ? await send("GET", `api/v1/uploads/${upload.id}`) : null;
         if (now && now.files[number].received !== offset) return now.files[number].received;
         throw new Error(told?.error?.message ?? `The server answered ${answer.status}.`);
       }
@@ -91,9 +91,9 @@
   }
 
   async function settle(upload, name = null) {
-    await send("POST", `/api/v1/uploads/${upload.id}/finish`, { name });
+    await send("POST", `api/v1/uploads/${upload.id}/finish`, { name });
     for (;;) {
-      const now = await send("GET", `/api/v1/uploads/${upload.id}`);
+      const now = await send("GET", `api/v1/uploads/${upload.id}`);
       if (now.state === "done") {
         isBusy = false; // Nothing is lost by leaving now.
         return (location.href = KINDS[now.result.kind](now.result.name));
@@ -137,7 +137,7 @@
   }
 
   async function listUnfinished() {
-    const { uploads } = await send("GET", "/api/v1/uploads");
+    const { uploads } = await send("GET", "api/v1/uploads");
     at("unfinished").replaceChildren(
       ...uploads.map((upload) => {
         const row = document.createElement("li");
@@ -149,7 +149,7 @@
         remove.className = "secondary outline";
         remove.textContent = "Remove";
         remove.setAttribute("aria-label", `Remove what was sent of ${upload.name}`);
-        remove.onclick = () => busy(remove, async () => (await send("DELETE", `/api/v1/uploads/${upload.id}`), listUnfinished()));
+        remove.onclick = () => busy(remove, async () => (await send("DELETE", `api/v1/uploads/${upload.id}`), listUnfinished()));
         row.append(about);
         if (isWhole) {
           const name = document.createElement("input");

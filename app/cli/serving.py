@@ -16,6 +16,7 @@ def serve(
     port: int | None = None,
     data_dir: DataDir = None,
     device: str | None = None,
+    root_path: str | None = None,
     engine: str | None = None,
     captures: tuple[Path, ...] = (),
     token_file: Path | None = None,
@@ -28,6 +29,8 @@ def serve(
         host: Address to listen on; others reach anything but loopback (PHYSHANDI_HOST, else
             127.0.0.1).
         port: Port to listen on; 0 takes a free one (PHYSHANDI_PORT, else 8080).
+        root_path: Path below which a reverse proxy serves it, such as /physhandi
+            (PHYSHANDI_ROOT_PATH, else none; see docs/security.md).
         device: Warp devices of fits: all (every GPU, or the CPU where there is none), auto (the
             first of them), cpu, or names like cuda:0,cuda:1. Each is given as many fits at a time
             as the others, one by default; the first also runs live scenes (PHYSHANDI_DEVICE, else
@@ -51,6 +54,7 @@ def serve(
         port=port,
         data_dir=data_dir,
         device=device,
+        root_path=root_path,
         engine=engine,
         captures=captures or None,
         token_file=token_file,

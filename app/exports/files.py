@@ -21,6 +21,7 @@ from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, FileRequest, Fo
 from app.exports.schema import MEDIA_TYPES, SlowFormat, errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
+from app.root_path import address_on
 from app.viewer.export.snapshot import snapshot_yaml
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
@@ -166,7 +167,9 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         query = read_query(request, without=_OWN_FIELDS)
         order = request_of(catalog, catalog.run(run_id), kind, query)
         work = file_cache.begin(replace(order, **asdict(picture)))
-        return describe_progress(work, f"/api/v1/runs/{run_id}/export?{request.url.query}")
+        return describe_progress(
+            work, address_on(request, f"/api/v1/runs/{run_id}/export?{request.url.query}")
+        )
 
     @router.get(
         "/sessions/{session_id}/export",

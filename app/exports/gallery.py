@@ -13,7 +13,7 @@ from app.exports.making import make
 from app.exports.shell import read_link
 from app.jobs.catalog import Catalog
 from app.jobs.views import RunSummary, summarize_run
-from app.pages.render import Pages
+from app.pages.render import fill
 from app.previews.clip import clip_of_run
 from physhandi.data.files import temporary_name, write_bytes, write_json
 from physhandi.errors import UsageError
@@ -92,8 +92,8 @@ def write_gallery(
             _write_run(run, name, folder, catalog, query, report=report)
             for run, name in zip(runs, names, strict=True)
         ]
-        page = Pages().render("gallery.html", title=title, cards=cards)
-        write_bytes(folder / _INDEX, bytes(page.body))
+        page = fill("gallery.html", title=title, cards=cards)
+        write_bytes(folder / _INDEX, page.encode())
         about = {"title": title, "runs": [_describe(card) for card in cards]}
         write_json(folder / GALLERY_FILE, about)
     return out / _INDEX

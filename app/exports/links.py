@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 from app.exports.permalink import state_from_query, state_to_query
 from app.exports.schema import errors
 from app.ids import ItemId
+from app.root_path import address_on
 from app.security import bare_page
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
@@ -74,7 +75,7 @@ def create_links(sessions: Sessions) -> APIRouter:
         if session is None:
             raise HTTPException(404, CLOSED)
         if not isinstance(session, Session):
-            return Link(url=session.link, query=session.link.partition("?")[2])
+            return Link(url=address_on(request, session.link), query=session.link.partition("?")[2])
         link, lost = link_of(session), ""
         if session.state.edits is not None:
             lost = (
@@ -82,7 +83,8 @@ def create_links(sessions: Sessions) -> APIRouter:
                 "and share that."
             )
         path = "" if session.camera_path is None else session.camera_path.to_text()
-        return Link(url=link, query=link.partition("?")[2], lost=lost, camera_path=path)
+        url, query = address_on(request, link), link.partition("?")[2]
+        return Link(url=url, query=query, lost=lost, camera_path=path)
 
     return router
 

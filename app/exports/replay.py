@@ -16,6 +16,7 @@ from app.exports.schema import errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.pages.render import Pages
+from app.root_path import address_on
 from app.viewer.ui.scene_frame import packed_scene_page, scene_page
 from physhandi.errors import UsageError
 
@@ -59,6 +60,7 @@ def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> API
         if sequence not in run.sequence_names:
             raise UsageError(f"sequence: run '{run_id}' has no sequence '{sequence[:80]}'.")
         return pages.render(
+            request,
             "replay.html",
             run_id=item.id,
             title=run.name,
@@ -70,12 +72,17 @@ def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> API
 
     @router.post("/api/v1/runs/{run_id}/replay", responses=errors(404, 409, 422, 429))
     def prepare(
-        run_id: ItemId, sequence: SequenceField = None, theme: ThemeField = "light"
+        request: Request,
+        run_id: ItemId,
+        sequence: SequenceField = None,
+        theme: ThemeField = "light",
     ) -> FileProgress:
         """Have the replay of a run made, unless it is there, and tell how far it is."""
         work = file_cache.begin(order(run_id, sequence, theme))
         query = {"theme": theme} | ({"sequence": sequence} if sequence else {})
-        return describe_progress(work, f"/api/v1/runs/{run_id}/replay.viser?{urlencode(query)}")
+        return describe_progress(
+            work, address_on(request, f"/api/v1/runs/{run_id}/replay.viser?{urlencode(query)}")
+        )
 
     @router.get(
         "/api/v1/runs/{run_id}/replay.viser",

@@ -13,7 +13,13 @@ from app.viewer.sessions import Sessions
 
 
 def create_exports(
-    catalog: Catalog, sessions: Sessions, pages: Pages, file_cache: FileCache, shares: Shares
+    catalog: Catalog,
+    sessions: Sessions,
+    pages: Pages,
+    file_cache: FileCache,
+    shares: Shares,
+    *,
+    root_path: str = "",
 ) -> APIRouter:
     """Make the routes of links, replays, shared pages and files, and let scenes know their links.
 
@@ -23,8 +29,9 @@ def create_exports(
         pages: Renders.
         file_cache: Makes files.
         shares: Keeps pages that were shared.
+        root_path: Path below which the application is reached.
     """
-    sessions.link_of = link_of
+    sessions.link_of = lambda session: f"{root_path}{link_of(session)}"
     router = APIRouter()
     router.include_router(create_links(sessions))
     router.include_router(create_files(catalog, sessions, file_cache))

@@ -26,6 +26,7 @@ from app.exports.links import read_query
 from app.exports.schema import errors
 from app.ids import ItemId
 from app.jobs.catalog import Catalog, NotFoundError
+from app.root_path import address_on
 from app.security import SHARED, bare_page
 from physhandi.data.files import temporary_name, write_json
 from physhandi.data.run_folder import read_json
@@ -185,6 +186,9 @@ def create_shares(catalog: Catalog, file_cache: FileCache, shares: Shares) -> AP
     """
     router = APIRouter()
 
+    def reached(share: Share, request: Request) -> Share:
+        return share.model_copy(update={"url": address_on(request, share.url)})
+
     @router.post("/api/v1/runs/{run_id}/shares", responses=errors(404, 409, 422, 429))
     def share(run_id: ItemId, request: Request) -> Share:
         """Make a page of a run that can be looked at without the token, until it is withdrawn.
@@ -202,12 +206,12 @@ def create_shares(catalog: Catalog, file_cache: FileCache, shares: Shares) -> AP
         )
         made = shares.add(page, about)
         request.state.made = {"share_id": made.id}
-        return made
+        return reached(made, request)
 
     @router.get("/api/v1/shares")
-    def list_shares(run: Annotated[ItemId | None, Query()] = None) -> list[Share]:
+    def list_shares(request: Request, run: Annotated[ItemId | None, Query()] = None) -> list[Share]:
         """List the shared pages, of one run or of all, the newest first."""
-        return [share for share in shares.all() if run in {None, share.run}]
+        return [reached(share, request) for share in shares.all() if run in {None, share.run}]
 
     @router.delete("/api/v1/shares/{share_id}", status_code=204, responses=errors(404))
     def withdraw(share_id: ItemId) -> Response:

@@ -75,7 +75,7 @@ class RunQuery(BaseModel):
         """Whether it leaves any run out."""
         return bool(self.q.strip() or self.state or self.profile or self.sequence or self.kind)
 
-    def address(self, path: str = "/runs", **changes: Any) -> str:
+    def address(self, path: str = "runs", **changes: Any) -> str:
         """Write it as an address, with some fields changed; what is not set is left out."""
         fields = self.model_dump() | {"offset": 0} | changes
         defaults = RunQuery()

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, cast
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.jobs.catalog import Catalog
@@ -99,11 +99,12 @@ def add_lists(
         return {"profiles": profiles, "usable": [s for s in sequences if not s["error"]]}
 
     @router.get("/")
-    def home() -> Response:
+    def home(request: Request) -> Response:
         cursor, runs = feed.snapshot()
         shown = runs[:_RECENT_RUNS] + [r for r in runs[_RECENT_RUNS:] if _is_kept(r)]
         sequences = described_sequences(runs)
         return pages.render(
+            request,
             "home.html",
             cursor=cursor,
             runs=pictured("run", shown),
@@ -117,6 +118,7 @@ def add_lists(
 
     @router.get("/runs")
     def list_runs(
+        request: Request,
         query: Annotated[RunQuery, Query()],
         hx_trigger: Annotated[str | None, Header(max_length=64)] = None,
     ) -> Response:
@@ -124,6 +126,7 @@ def add_lists(
         query = query if query.limit else query.model_copy(update={"limit": _PAGE})
         chosen, problem = _chosen(runs, query)
         page = pages.render(
+            request,
             "runs.html",
             cursor=cursor,
             query=query,
@@ -144,11 +147,12 @@ def add_lists(
         return page
 
     @router.get("/sequences")
-    def list_sequences(query: Annotated[SequenceQuery, Query()]) -> Response:
+    def list_sequences(request: Request, query: Annotated[SequenceQuery, Query()]) -> Response:
         cursor, runs = feed.snapshot()
         sequences = described_sequences(runs)
         chosen = _chosen_sequences(sequences, query)
         return pages.render(
+            request,
             "sequences.html",
             cursor=cursor,
             query=query,

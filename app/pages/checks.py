@@ -4,7 +4,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
@@ -50,12 +50,13 @@ def add_checks(router: APIRouter, catalog: Catalog, models: ModelFolders, pages:
 
     @router.get("/sequences/{sequence_id}/check")
     def show_check(
-        sequence_id: ItemId, frame: Annotated[int, Query(ge=0, le=10_000_000)] = 0
+        request: Request, sequence_id: ItemId, frame: Annotated[int, Query(ge=0, le=10_000_000)] = 0
     ) -> HTMLResponse:
         item = catalog.sequence_item(sequence_id)
         sequence = item.sequence
         stages = readiness(sequence) if sequence is not None else {}
         return pages.render(
+            request,
             "check.html",
             item=item,
             sequence=sequence,
@@ -74,11 +75,11 @@ def add_checks(router: APIRouter, catalog: Catalog, models: ModelFolders, pages:
         )
 
     @router.get("/sequences/{sequence_id}/problems")
-    def show_problems(sequence_id: ItemId) -> HTMLResponse:
+    def show_problems(request: Request, sequence_id: ItemId) -> HTMLResponse:
         """Read every file, which takes seconds, and give stages and problems."""
         item = catalog.sequence_item(sequence_id)
         found = check_item(item).to_dict()
-        return pages.render("_checked.html", **found, about=ABOUT, is_whole=True)
+        return pages.render(request, "_checked.html", **found, about=ABOUT, is_whole=True)
 
     @router.get("/sequences/{sequence_id}/views/{view_name}/frames/{frame}")
     def show_frame(

@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 
 from app.jobs.catalog import Catalog
@@ -23,12 +23,13 @@ def add_imports(router: APIRouter, catalog: Catalog, imports: Imports, pages: Pa
     """
 
     @router.get("/import")
-    def show_import(folder: _Place = "") -> HTMLResponse:
+    def show_import(request: Request, folder: _Place = "") -> HTMLResponse:
         roots = imports.folders.roots
         place = folder.strip("/") or (next(iter(roots)) if len(roots) == 1 else "")
         is_chosen = bool(place) and place not in roots
         parts = place.split("/") if place else []
         return pages.render(
+            request,
             "import.html",
             place=place,
             chosen=parts[-1] if is_chosen else "",
@@ -40,11 +41,12 @@ def add_imports(router: APIRouter, catalog: Catalog, imports: Imports, pages: Pa
         )
 
     @router.get("/import/survey")
-    def show_survey(source: _Place) -> HTMLResponse:
+    def show_survey(request: Request, source: _Place) -> HTMLResponse:
         """Look at a recording, which takes seconds, and ask for what it does not say."""
         name = source.split("/")[-1].partition(".")[0]
         taken = {item.id for item in catalog.sequences()}
         return pages.render(
+            request,
             "_survey.html",
             source=source,
             survey=imports.survey(source),

@@ -5,11 +5,13 @@ from functools import cache
 from typing import Any
 from urllib.parse import urlencode
 
+from fastapi import Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from app.jobs.log import level_of
 from app.keys import KEYS
+from app.security import READ_ONLY
 from app.settings import WEB_ASSETS
 
 _SPELLINGS = {
@@ -52,21 +54,39 @@ def _environment() -> Environment:
         millimetres=millimetres,
         query=query,
     )
-    environment.globals["key_groups"] = KEYS
+    environment.globals.update(key_groups=KEYS, only_looks=READ_ONLY)
     return environment
 
 
+def fill(name: str, **values: Any) -> str:
+    """Fill a template; everything a user wrote is escaped."""
+    return _environment().get_template(name).render(values)
+
+
 class Pages:
-    """Renders templates; everything a user wrote is escaped."""
+    """Renders the pages of the application."""
 
-    def render(self, name: str, *, status: int = 200, **values: Any) -> HTMLResponse:
-        """Fill a template."""
-        return HTMLResponse(_environment().get_template(name).render(values), status_code=status)
+    def render(
+        self, request: Request, name: str, *, status: int = 200, **values: Any
+    ) -> HTMLResponse:
+        """Fill a template for who asks.
 
-    def error(self, status: int, message: str) -> HTMLResponse:
+        Args:
+            request: Who asks.
+            name: File of the template.
+            status: HTTP status.
+            values: What the template needs.
+        """
+        values["root_path"] = request.app.state.root_path
+        values["may_change"] = getattr(request.state, "may_change", False)
+        return HTMLResponse(fill(name, **values), status_code=status)
+
+    def error(self, request: Request, status: int, message: str) -> HTMLResponse:
         """Show an error in the frame of the application."""
         title = _TITLES.get(status, "That did not work")
-        return self.render("error.html", status=status, code=status, title=title, message=message)
+        return self.render(
+            request, "error.html", status=status, code=status, title=title, message=message
+        )
 
 
 def short(value: Any) -> str:

@@ -81,21 +81,24 @@ def create_pages(
     _add_recovery(router, recovery, retention, pages)
 
     @router.get("/runs/{run_id}")
-    def run(run_id: ItemId) -> HTMLResponse:
+    def run(request: Request, run_id: ItemId) -> HTMLResponse:
         item = catalog.run_item(run_id)
         described = follow_run(item, scheduler)
         log = read_log(item.folder, is_ended=described["state"] in ENDED)
         values = run_values(item, described, catalog)
-        return pages.render("run.html", log=log, is_listed=item.run is not None, **values)
+        return pages.render(request, "run.html", log=log, is_listed=item.run is not None, **values)
 
     @router.get("/runs/{run_id}/parts")
-    def parts(run_id: ItemId) -> HTMLResponse:
+    def parts(request: Request, run_id: ItemId) -> HTMLResponse:
         """Give the parts of a run's page that change when a stage or the run ends."""
         item = catalog.run_item(run_id)
-        return pages.render("parts.html", **run_values(item, follow_run(item, scheduler), catalog))
+        return pages.render(
+            request, "parts.html", **run_values(item, follow_run(item, scheduler), catalog)
+        )
 
     @router.get("/diff")
     def diff(
+        request: Request,
         run: Annotated[list[ItemId], Query(max_length=20)] = [],  # noqa: B006  # FastAPI copies it
         show: Literal["differences", "all"] = "differences",
     ) -> HTMLResponse:
@@ -113,6 +116,7 @@ def create_pages(
             [describe_results(item.run) if item.run else {} for item in items],
         )
         return pages.render(
+            request,
             "diff.html",
             runs=[entry | {"picture": previews.look("run", entry["id"])} for entry in described],
             sections=sections,
@@ -124,12 +128,13 @@ def create_pages(
     def live(session_id: ItemId, request: Request) -> HTMLResponse:
         scene = sessions.find(session_id, request.state.owner)
         if scene is not None:
-            return pages.render("live.html", session=session_id, scene=scene.info)
+            return pages.render(request, "live.html", session=session_id, scene=scene.info)
         closed = sessions.closed_session(session_id, request.state.owner)
         if closed is not None:
             query = request.url.query
-            return pages.render("closed.html", status=404, scene=closed, query=query)
+            return pages.render(request, "closed.html", status=404, scene=closed, query=query)
         return pages.error(
+            request,
             404,
             "This live scene was closed, or it belongs to another browser. "
             "Open your own from the home page.",
@@ -151,23 +156,25 @@ def _add_recovery(
     router: APIRouter, recovery: Recovery, retention: Retention, pages: Pages
 ) -> None:
     @router.get("/recovery")
-    def show_recovery() -> HTMLResponse:
+    def show_recovery(request: Request) -> HTMLResponse:
         found, going = recovery.describe(), retention.describe()
-        return pages.render("recovery.html", found=found, going=going)
+        return pages.render(request, "recovery.html", found=found, going=going)
 
 
 def _add_launch(router: APIRouter, catalog: Catalog, overview: Overview, pages: Pages) -> None:
     @router.get("/system")
-    def system() -> HTMLResponse:
-        return pages.render("system.html", system=overview.whole())
+    def system(request: Request) -> HTMLResponse:
+        return pages.render(request, "system.html", system=overview.whole())
 
     @router.get("/launch")
     def launch(
+        request: Request,
         run: Annotated[ItemId | None, Query()] = None,
         profile: Annotated[ItemId | None, Query()] = None,
         sequence: Annotated[ItemId | None, Query()] = None,
     ) -> HTMLResponse:
-        return _launch_page(catalog, pages, run, profile, sequence)
+        values = _launch_values(catalog, run, profile, sequence)
+        return pages.render(request, "launch.html", **values)
 
 
 def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> dict[str, Any]:
@@ -192,9 +199,10 @@ def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> di
     }
 
 
-def _launch_page(
-    catalog: Catalog, pages: Pages, run_id: str | None, profile: str | None, sequence: str | None
-) -> HTMLResponse:
+def _launch_values(
+    catalog: Catalog, run_id: str | None, profile: str | None, sequence: str | None
+) -> dict[str, Any]:
+    """Collect what the page shows on which every setting of a fit can be chosen."""
     offered = describe_settings(catalog, profile, run_id)
     sequences = [entry for s in catalog.sequences() if not (entry := describe_sequence(s))["error"]]
     item = catalog.run_item(run_id) if run_id else None
@@ -211,17 +219,16 @@ def _launch_page(
     groups: dict[str, list[dict[str, Any]]] = {}
     for setting in offered["settings"]:
         groups.setdefault(setting["group_name"], []).append(setting)
-    return pages.render(
-        "launch.html",
-        parent=item and {"id": item.id, "name": item.run.name if item.run else item.id},
-        profile=offered["profile"],
-        description=offered["description"],
-        profiles=[(name, named_profile(name).description) for name in profile_names()],
-        groups=groups,
-        sequences=sequences,
-        chosen=chosen,
-        missing=missing,
-    )
+    return {
+        "parent": item and {"id": item.id, "name": item.run.name if item.run else item.id},
+        "profile": offered["profile"],
+        "description": offered["description"],
+        "profiles": [(name, named_profile(name).description) for name in profile_names()],
+        "groups": groups,
+        "sequences": sequences,
+        "chosen": chosen,
+        "missing": missing,
+    }
 
 
 @lru_cache(maxsize=256)

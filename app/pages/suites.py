@@ -5,7 +5,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -102,15 +102,20 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
     """
 
     @router.get("/suites")
-    def list_suites() -> HTMLResponse:
-        return pages.render("suites.html", suites=[_described(path) for path in _folders(folder)])
+    def list_suites(request: Request) -> HTMLResponse:
+        return pages.render(
+            request, "suites.html", suites=[_described(path) for path in _folders(folder)]
+        )
 
     @router.get("/suites/{name}")
-    def show_suite(name: Name, query: Annotated[CellQuery, Query()]) -> HTMLResponse:
+    def show_suite(
+        request: Request, name: Name, query: Annotated[CellQuery, Query()]
+    ) -> HTMLResponse:
         path = _found(folder, name)
         content = _read(path)
         about, cells = content.about, content.cells
         return pages.render(
+            request,
             "suite.html",
             suite=name,
             about=about,

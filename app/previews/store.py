@@ -110,7 +110,7 @@ class Previews:
         source = self._source(kind, item_id)
         if source is None:
             return PreviewPictures("none")
-        address, version = f"/{source.kind}s/{source.id}", source.key[-16:]
+        address, version = f"{source.kind}s/{source.id}", source.key[-16:]
         still = f"{address}/still?v={version}" if self._path(source, STILL).is_file() else ""
         if self._path(source, MOVING).is_file():
             return PreviewPictures("ready", still, f"{address}/preview?v={version}")

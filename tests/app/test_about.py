@@ -124,4 +124,4 @@ def test_a_page_begins_with_the_errors_of_the_run(world: World, client: TestClie
     assert error > 0
     page = world.browser().get("/runs/fitted").text
     assert f"<dd>{1000 * error:.2f} mm</dd>" in page
-    assert '<li><a href="/runs">Runs</a></li>' in page
+    assert '<li><a href="runs">Runs</a></li>' in page

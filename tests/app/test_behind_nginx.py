@@ -41,6 +41,8 @@ class Proxy:
     world: World
     port: int
     trust: ssl.SSLContext
+    root: str
+    """Path below which it serves."""
 
     def wire(self, client: str = "127.0.0.1") -> socket.socket:
         return socket.create_connection(("127.0.0.1", self.port), LIMIT_S, (client, 0))
@@ -51,12 +53,12 @@ class Proxy:
         connection = http.client.HTTPSConnection(NAME, timeout=LIMIT_S)
         connection.sock = self.trust.wrap_socket(self.wire(client), server_hostname=NAME)
         sent = {name.replace("_", "-"): value for name, value in headers.items()}
-        connection.request(method, path, body, sent | {"Connection": "close"})
+        connection.request(method, self.root + path, body, sent | {"Connection": "close"})
         return connection.getresponse()
 
     def watch(self, session: str, **headers: str) -> ClientConnection:
         return connect(
-            f"wss://{NAME}/viewer/{session}",
+            f"wss://{NAME}{self.root}/viewer/{session}",
             sock=self.wire(),
             ssl=self.trust,
             server_hostname=NAME,
@@ -69,15 +71,17 @@ class Proxy:
     def sign_in(self) -> str:
         """Come in as a browser does; returns its cookie."""
         answer = self.send("GET", f"/runs?token={TOKEN}")
-        assert (answer.status, answer.headers["Location"]) == (303, "/runs")
+        assert (answer.status, answer.headers["Location"]) == (303, f"{self.root}/runs")
         cookie = answer.headers["Set-Cookie"]
-        assert {"Secure", "HttpOnly", "SameSite=strict"} <= set(cookie.split("; "))
+        kinds = {"Secure", "HttpOnly", "SameSite=strict", f"Path={self.root or '/'}"}
+        assert kinds <= set(cookie.split("; "))
         return cookie.partition(";")[0]
 
 
-@pytest.fixture
-def proxy(world: World, tmp_path: Path) -> Iterator[Proxy]:
-    settings = world.settings.model_copy(update={"allowed_hosts": (NAME,)})
+@pytest.fixture(params=["", "/physhandi"])
+def proxy(world: World, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Proxy]:
+    root: str = request.param
+    settings = world.settings.model_copy(update={"allowed_hosts": (NAME,), "root_path": root})
     app = create_app(
         settings,
         security=Security(settings),
@@ -93,10 +97,11 @@ def proxy(world: World, tmp_path: Path) -> Iterator[Proxy]:
     thread.start()
     until(lambda: server.started)
     listener = socket.create_server(("127.0.0.1", 0))
-    nginx = start_nginx(tmp_path, listener, server.servers[0].sockets[0].getsockname()[1])
+    upstream = server.servers[0].sockets[0].getsockname()[1]
+    nginx = start_nginx(tmp_path, listener, upstream, root)
     trust = ssl.create_default_context(cafile=tmp_path / "cert.pem")
     try:
-        yield Proxy(world, listener.getsockname()[1], trust)
+        yield Proxy(world, listener.getsockname()[1], trust, root)
     finally:
         nginx.terminate()
         nginx.wait()
@@ -107,7 +112,9 @@ def proxy(world: World, tmp_path: Path) -> Iterator[Proxy]:
         world.sessions.shutdown()
 
 
-def start_nginx(folder: Path, listener: socket.socket, upstream: int) -> subprocess.Popen[bytes]:
+def start_nginx(
+    folder: Path, listener: socket.socket, upstream: int, root: str
+) -> subprocess.Popen[bytes]:
     """Start it with the text of the page, in which only addresses and places are others."""
     made = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -batch"
     wanted = ["-subj", f"/CN={NAME}", "-addext", f"subjectAltName=DNS:{NAME}"]
@@ -119,7 +126,8 @@ def start_nginx(folder: Path, listener: socket.socket, upstream: int) -> subproc
         ("listen 443 ssl;", f"listen {place} ssl;"),
         ("/etc/ssl/certs/physhandi.pem", f"{folder}/cert.pem"),
         ("/etc/ssl/private/physhandi.key", f"{folder}/key.pem"),
-        ("http://127.0.0.1:8080;", f"http://127.0.0.1:{upstream};"),
+        ("        proxy_pass http://127.0.0.1:8080;", f"proxy_pass http://127.0.0.1:{upstream};"),
+        ("    location / {", f"    location {root}/ {{"),
     ):
         assert example.count(old) == 1
         example = example.replace(old, new)
@@ -165,7 +173,8 @@ def test_pages_changes_and_addresses_are_as_without_a_proxy(proxy: Proxy) -> Non
     answer = proxy.send("PATCH", path, change, client="127.0.0.2", **forged, **own)
     assert (answer.status, told(answer)["name"]) == (200, "through nginx")
     log = proxy.world.settings.audit_dir / "audit.jsonl"
-    assert json.loads(log.read_text().splitlines()[-1])["client"] == "127.0.0.2"
+    # It is noted once it has been answered.
+    until(lambda: json.loads(log.read_text().splitlines()[-1])["client"] == "127.0.0.2")
     assert proxy.send("POST", path, "x" * (2**20 + 1), Origin=ORIGIN, **own).status == 413
     # Nobody counts for others behind the same proxy.
     for _ in range(21):
@@ -187,7 +196,7 @@ def test_events_come_at_once(proxy: Proxy) -> None:
 def test_a_live_scene_is_seen_by_its_own_page_alone(proxy: Proxy) -> None:
     cookie = proxy.sign_in()
     opened = proxy.send("GET", "/sequences/sheet/view", Cookie=cookie)
-    session = opened.headers["Location"].removeprefix("/live/").partition("?")[0]
+    session = opened.headers["Location"].removeprefix(f"{proxy.root}/live/").partition("?")[0]
     assert proxy.send("GET", f"/viewer/{session}/", Cookie=cookie).status == 200
     with proxy.watch(session, Cookie=cookie, Origin=ORIGIN) as scene:
         assert scene.subprotocol == PROTOCOL

@@ -54,7 +54,7 @@ def test_the_page_shows_views_layers_and_stages_at_once(browser: TestClient) -> 
     assert re.findall(r'name="layer" value="(\w+)"', text) == ["mask", "keypoint", "track"]
     assert "Reading every file" in text
     assert text.count("will run") == len(STAGES)
-    assert 'href="/sequences/filmed/check"' in browser.get("/sequences").text
+    assert 'href="sequences/filmed/check"' in browser.get("/sequences").text
     assert browser.get("/sequences/nowhere/check").status_code == 404
     # A recording of markers has no views, but stages.
     markers = browser.get("/sequences/sheet/check").text

@@ -136,15 +136,15 @@ def world(data_dir: Path) -> World:
 
 def test_a_recording_is_chosen_described_and_imported(world: World) -> None:
     browser, client = world.browser(), world.script()
-    assert 'href="/import"' in browser.get("/").text
-    assert 'href="/import"' in browser.get("/sequences").text
+    assert 'href="import"' in browser.get("/").text
+    assert 'href="import"' in browser.get("/sequences").text
     top = browser.get("/import").text
-    assert 'href="/import?folder=captures"' in top
+    assert 'href="import?folder=captures"' in top
     assert 'id="survey"' not in top
     inside = browser.get("/import?folder=captures").text
-    assert 'href="/import?folder=captures/ball"' in inside
+    assert 'href="import?folder=captures/ball"' in inside
     assert (
-        'hx-get="/import/survey?source=captures/ball"'
+        'hx-get="import/survey?source=captures/ball"'
         in browser.get("/import?folder=captures/ball").text
     )
     survey = browser.get("/import/survey?source=captures/ball").text

@@ -2,6 +2,9 @@ import base64
 import hashlib
 import json
 import re
+from types import SimpleNamespace
+
+from starlette.requests import Request
 
 from app.jobs.views import thin
 from app.pages.render import Pages, duration, short, words
@@ -56,6 +59,7 @@ def test_numbers_keep_four_digits_and_names_become_words() -> None:
 
 
 def test_a_page_that_is_missing_leads_to_the_lists() -> None:
-    page = bytes(Pages().error(404, "There is no run '<b>'.").body).decode()
-    assert all(f'href="{address}"' in page for address in ("/", "/runs", "/sequences"))
+    asked = Request({"type": "http", "app": SimpleNamespace(state=SimpleNamespace(root_path=""))})
+    page = bytes(Pages().error(asked, 404, "There is no run '<b>'.").body).decode()
+    assert all(f'href="{address}"' in page for address in (".", "runs", "sequences"))
     assert "&#39;&lt;b&gt;&#39;" in page

@@ -150,7 +150,7 @@ def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -
         until_ready(previews, "sequence", "empty")
         assert previews.look("sequence", "empty").state == "none"
         picture = previews.look("sequence", "sheet")
-        assert picture.still.startswith("/sequences/sheet/still?v=")
+        assert picture.still.startswith("sequences/sheet/still?v=")
         path = previews.file("sequence", "sheet", is_moving=True)
         assert path is not None
         with Image.open(path) as moving:
@@ -172,7 +172,7 @@ def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -
         kept.mkdir()
         assert previews.look("run", "fitted").state == "pending"
         until_ready(previews, "run", "fitted")
-        assert previews.look("run", "fitted").moving.startswith("/runs/fitted/preview?v=")
+        assert previews.look("run", "fitted").moving.startswith("runs/fitted/preview?v=")
         assert sorted(world.settings.run_dir.rglob("*")) == before
     finally:
         previews.shutdown()
@@ -323,7 +323,7 @@ def test_a_run_without_results_shows_its_sequence(world: World) -> None:
         (world.settings.preview_dir / f"{source.key}{ending}").write_bytes(b"RIFF")
     told = client.get(f"/runs/{run_id}/picture").json()
     assert told["state"] == "ready"
-    assert told["moving"].startswith("/sequences/sheet/preview?v=")
+    assert told["moving"].startswith("sequences/sheet/preview?v=")
     answer = client.get(told["moving"])
     assert (answer.content, answer.headers["content-type"]) == (b"RIFF", "image/webp")
     assert "immutable" in answer.headers["cache-control"]

@@ -355,7 +355,7 @@ def test_a_server_tells_what_it_found_when_it_started(
     assert asked["claims"] == ["runs/lost"]
     (restart,) = asked["restarted"]
     assert (restart["run"], restart["why"].endswith("It has failed.")) == ("lost", True)
-    assert 'href="/runs/lost"' in page
+    assert 'href="runs/lost"' in page
     assert "Nothing was left behind" not in page
 
 

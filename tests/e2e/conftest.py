@@ -33,6 +33,8 @@ from waiting import LIMIT_S, until
 from app.jobs.processes import end_processes
 
 ROOT = Path(__file__).parents[2]
+BELOW = "/lab/physhandi"
+"""Path below which the servers of these tests serve, as behind a proxy."""
 START = "from app.cli import main; main()"
 _CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist", *LESS_DRAWING]
 _VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
@@ -56,8 +58,15 @@ class Served:
 
     url: str
     """The address that it printed, with the token."""
+    read_only_url: str
+    """The one for people who may only look."""
     data_dir: Path
     """Where it keeps runs."""
+
+    @property
+    def base(self) -> str:
+        """What all its addresses begin with; a path with a slash follows."""
+        return self.url.partition("?")[0].rstrip("/")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -68,13 +77,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.no_cover)
 
 
+_ROOTS: dict[str, str] = {}
+"""What addresses of each server begin with, and what they have to."""
+
+
+def _leads_out(url: str) -> bool:
+    """Tell whether an address of a server is not below its path."""
+    begin = url.replace("ws://", "http://", 1)
+    return any(
+        begin.startswith(f"{origin}/") and not begin.startswith(f"{base}/")
+        for origin, base in _ROOTS.items()
+    )
+
+
 @contextmanager
 def _serving(folder: Path) -> Iterator[Served]:
     """Start the program in a folder as a user does, and end it with the fits that it began."""
     # Users start it where they work, and often have a package of this name there.
     (folder / "app").mkdir()
     (folder / "app" / "__init__.py").write_text("raise SystemExit('a package of the user')")
-    command = [sys.executable, "-P", "-c", START, "serve", "--port", "0", "--data-dir", "data"]
+    options = ["--port", "0", "--data-dir", "data", "--root-path", BELOW]
+    options += ["--read-only-token-file", "read_only"]
+    command = [sys.executable, "-P", "-c", START, "serve", *options]
     printed = folder / "printed"
     with printed.open("w") as out, (folder / "log").open("w") as log:
         # Tabs that tests have left keep their scenes for a while.
@@ -84,10 +108,12 @@ def _serving(folder: Path) -> Iterator[Served]:
 
         def has_printed() -> bool:
             assert server.poll() is None, (folder / "log").read_text()
-            return printed.read_text().endswith("\n")
+            return printed.read_text().count("\n") == 2
 
         until(has_printed, (folder / "log").read_text)
-        yield Served(printed.read_text().strip(), folder / "data")
+        served = Served(*printed.read_text().split(), folder / "data")
+        _ROOTS[served.base.removesuffix(BELOW)] = served.base
+        yield served
     finally:
         for run in (folder / "data" / "runs").glob("*"):
             end_processes(run, grace_s=0)
@@ -153,6 +179,13 @@ def _complaints_in(context: BrowserContext) -> list[str]:
         lambda m: m.type == "error" and _HARMLESS not in m.text and complaints.append(m.text),
     )
     context.on("weberror", lambda error: complaints.append(str(error.error)))
+
+    def watch(url: str) -> None:
+        if _leads_out(url):
+            complaints.append(f"{url} is not below the server's path")
+
+    context.on("request", lambda request: watch(request.url))
+    context.on("page", lambda page: page.on("websocket", lambda socket: watch(socket.url)))
     return complaints
 
 

@@ -43,7 +43,7 @@ def page(browser: Browser, served) -> Iterator[Page]:
     assert defects == []
 
 
-def test_what_is_broken_is_told_where_the_user_meets_it(page: Page) -> None:
+def test_what_is_broken_is_told_where_the_user_meets_it(page: Page, served) -> None:
     # A recording that cannot be read says why, and can only be moved aside.
     card = page.locator("[data-sequence=unreadable]")
     expect(card.locator(".problem")).to_contain_text("field 'colour' is not known")
@@ -67,15 +67,10 @@ def test_what_is_broken_is_told_where_the_user_meets_it(page: Page) -> None:
 
     # An address of nothing is a page with a way home.
     for path in ("/runs/nothing", "/runs/..%2f..%2fetc", "/live/nothing", "/sequences/x/thumbnail"):
-        answer = page.goto(_at(page, path))
+        answer = page.goto(f"{served.base}{path}")
         assert answer is not None
         assert answer.status == 404
         text = page.locator("body").inner_text()
         assert "Traceback" not in text
         assert "{" not in text
-        expect(page.locator("a[href='/']").first).to_be_visible()
-
-
-def _at(page: Page, path: str) -> str:
-    scheme, _, rest = page.url.partition("://")
-    return f"{scheme}://{rest.partition('/')[0]}{path}"
+        expect(page.locator("a[href='.']").first).to_be_visible()

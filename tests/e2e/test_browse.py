@@ -42,7 +42,7 @@ def base(home: Page, served) -> str:
             about.write_text(about.read_text().replace("Towel fold, fitted", name))
     parameters = served.data_dir / "runs" / "copy1" / "attempts/1/out/object/parameters.yaml"
     parameters.write_text(re.sub(r"(?m)^drag: .*", "drag: 1.25", parameters.read_text()))
-    return re.match(r"https?://[^/]+", home.url)[0]
+    return served.base
 
 
 def test_runs_are_filtered_sorted_chosen_and_compared(home: Page, base: str, picture) -> None:

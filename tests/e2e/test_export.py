@@ -6,7 +6,7 @@ import zipfile
 from pathlib import Path
 from time import monotonic
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, urljoin, urlsplit
 
 import cv2
 import numpy as np
@@ -37,9 +37,8 @@ def places(position: np.ndarray, camera: dict[str, Any], shape: Any) -> tuple[An
 
 
 @pytest.fixture
-def base(home: Page) -> str:
-    place = urlsplit(home.url)
-    return f"{place.scheme}://{place.netloc}"
+def base(served: Any) -> str:
+    return served.base
 
 
 def test_a_link_opens_a_scene_whose_files_agree_with_the_server_s(
@@ -79,7 +78,7 @@ def test_a_link_opens_a_scene_whose_files_agree_with_the_server_s(
     assert np.abs(position - fitted).max() > 1e-3
 
     size = f"width={seen.shape[1]}&height={seen.shape[0]}"
-    session = urlsplit(home.url).path.removeprefix("/live/")
+    session = urlsplit(home.url).path.partition("/live/")[2]
     answer = context.request.get(f"{base}/api/v1/sessions/{session}/export?format=png&{size}")
     painted = cv2.imdecode(np.frombuffer(answer.body(), np.uint8), 1)
     ours, theirs = blue(painted), blue(seen)
@@ -125,7 +124,7 @@ def test_a_replay_plays_without_a_session_and_from_one_file(
     stranger.add_init_script(FEWER_PICTURES)
     complaints: list[str] = []
     stranger.on("console", lambda m: m.type == "error" and complaints.append(m.text))
-    stranger.goto(f"{base}{address}")
+    stranger.goto(urljoin(base, address))
     stranger.locator("input.mantine-NumberInput-input").wait_for()
     until_drawn(stranger)
     stranger.context.close()
@@ -139,7 +138,8 @@ def copied_link(page: Page) -> dict[str, list[str]]:
     page.get_by_role("button", name="Copy link").click()
     expect(page.locator("#toast")).to_contain_text("Link copied")
     copied = urlsplit(page.evaluate("navigator.clipboard.readText()"))
-    assert copied.path == "/runs/towel_fold_quick/view"
+    below = urlsplit(page.url).path.partition("/live/")[0]
+    assert copied.path == f"{below}/runs/towel_fold_quick/view"
     return parse_qs(copied.query)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import pytest
 from waiting import LIMIT_S
@@ -63,8 +63,10 @@ def test_the_printed_address_opens_and_the_server_ends_while_it_is_followed(
     cookie["Cookie"] = moved.headers["set-cookie"].partition(";")[0]
     page = get("/")[1].decode()
     assert "towel_fold" in page
-    for path in re.findall(r'(?:src|href)="(/[^"#]+)"', page):
-        assert get(urlsplit(path).path)[0].status == 200, path
+    addresses = re.findall(r'(?:src|href)="([^"#]+)"', page)
+    assert len(addresses) > 20
+    for address in addresses:
+        assert get(urlsplit(urljoin(url, address)).path)[0].status == 200, address
 
     stream, events = ask("/api/v1/events")
     assert events.readline().startswith(b"retry")

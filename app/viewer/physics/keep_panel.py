@@ -210,7 +210,7 @@ def _checked_name(name: str) -> str:
 def saved_html(run: SavedRun) -> str:
     """Say how far a saved run is, with a link to it."""
     name = html.escape(run.name)
-    link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>{name}</a>"
+    link = f"<a href='../../runs/{run.id}' target='_blank' rel='noopener'>{name}</a>"
     texts = {
         "queued": f"Saving run {link}…",
         "running": f"Simulating and measuring run {link}…",

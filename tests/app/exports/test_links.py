@@ -63,7 +63,7 @@ def test_the_link_of_a_scene_opens_another_one_like_it(world: World) -> None:
     world.sessions.close(session)
     gone = browser.get(f"{location}&from=%22%3E")
     assert gone.status_code == 404
-    assert f'href="/runs/fitted/view?{QUERY.replace("&", "&amp;")}&amp;from=%22%3E"' in gone.text
+    assert f'href="runs/fitted/view?{QUERY.replace("&", "&amp;")}&amp;from=%22%3E"' in gone.text
     world.sessions.shutdown()
 
 

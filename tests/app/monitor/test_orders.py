@@ -53,7 +53,7 @@ def test_only_what_differs_is_kept_as_changes_and_all_settings_are_stored(
     assert rows["object_.search.variables.friction"] == ("not searched", "0 to 1")
     assert rows["object_.search.variables.drag"] == ("0 to 10", "not searched")
     page = world.client.get(f"/runs/{run_id}").text
-    assert 'Made from <a href="/runs/fitted">a sheet</a>' in page
+    assert 'Made from <a href="runs/fitted">a sheet</a>' in page
     assert "4 settings differ from profile quick" in page
     assert world.client.delete("/api/v1/runs/fitted").status_code == 204
     assert "which was deleted since" in world.client.get(f"/runs/{run_id}").text

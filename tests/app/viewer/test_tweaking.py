@@ -234,7 +234,7 @@ def test_a_run_is_saved_with_what_the_sliders_changed(sessions, begun, noted) ->
         assert Run.open(Path(opened.config["source"])).id == "sheet"
         until(lambda: noted)
         assert noted == [("me", "keep a run", run.id)]
-        link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>"
+        link = f"<a href='../../runs/{run.id}' target='_blank' rel='noopener'>"
         client.until(lambda: f"Saving run {link}Moon &lt;b&gt;sheet&lt;/b&gt;</a>" in drawn(client))
         with run.begin_attempt() as attempt:
             attempt.fail("the disk is full")

@@ -1,0 +1,131 @@
+"""Who may only look meets no button that answers "you may not", on any page."""
+
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import Browser, Page, Request, expect
+from scene_page import FEWER_PICTURES, TIMEOUT_MS
+
+from app.security import only_looks
+
+pytestmark = pytest.mark.e2e
+BUNDLED = Path(__file__).parents[2] / "sequences"
+RUN, TORN = "kept_towel", "torn_towel"
+PAGES = (
+    "/",
+    "/runs",
+    f"/runs/{RUN}",
+    f"/runs/{TORN}",
+    f"/runs/{RUN}/compare",
+    f"/runs/{RUN}/replay",
+    "/sequences",
+    "/sequences/towel_fold/check",
+    "/launch",
+    f"/launch?run={RUN}",
+    "/import",
+    "/import?folder=captures",
+    "/system",
+    "/recovery",
+    "/suites",
+    f"/diff?run={RUN}&run=towel_fold_quick",
+    f"/compare?a={RUN}&b=towel_fold_quick",
+    f"/runs/{RUN}/view",
+)
+_LAUNCH = {"+ Launch fit", "Launch fit", "Launch", "Change settings first …"}
+_ROWS = {f"Delete {RUN}", "Move aside"}
+_SEND = {"Choose a folder", "Choose files", "Pause", "Try the example"}
+CHANGING = {
+    "/": _LAUNCH | _ROWS | {"Import a recording"},
+    "/runs": _LAUNCH - {"Launch fit"} | _ROWS,
+    f"/runs/{RUN}": {"Edit", "Save", "Cancel", "Share", "Rerun with changes"} | {f"Delete {RUN}"},
+    f"/runs/{TORN}": {"Move aside"},
+    "/sequences": _LAUNCH - {"+ Launch fit"} | {"Import a recording"},
+    "/sequences/towel_fold/check": {"Launch fit"},
+    "/launch": {"Launch"},
+    f"/launch?run={RUN}": {"Launch"},
+    "/import": _SEND,
+    "/import?folder=captures": _SEND,
+    "/recovery": {"Move aside"},
+    f"/runs/{RUN}/view": {"Share this replay LINK"},
+}
+"""What pages offer to those alone who may change things."""
+_BUTTONS = "button, summary, [data-share-view]"
+_OFFERED = """(buttons) => [...document.querySelectorAll(buttons)]
+  .filter((button) => !button.disabled && !button.closest(".charts"))
+  .map((button) => button.getAttribute("aria-label") ?? button.textContent.trim())"""
+_PRESS_ALL = """(names) => {
+  const buttons = [...document.querySelectorAll(names)]
+    .filter((button) => !button.disabled && !button.closest("form[method=get], [data-open]"));
+  buttons.forEach((button) => button.click());
+  return buttons.length;
+}"""
+"""Press all buttons, be they visible or not, but those that only lead to another address."""
+_EMPTY_SCENE = re.compile("/viewer/")
+
+
+@pytest.fixture
+def shown(served: Any) -> Iterator[None]:
+    """A run that may be deleted, and one that is damaged."""
+    for name in (RUN, TORN):
+        folder = served.data_dir / "runs" / name
+        shutil.copytree(BUNDLED / "runs" / "towel_fold_quick", folder)
+        job, about = folder / "job.yaml", folder / "run.yaml"
+        job.write_text(job.read_text().replace("../../towel_fold", str(BUNDLED / "towel_fold")))
+        about.write_text(about.read_text().replace("Towel fold, fitted", name))
+    (served.data_dir / "runs" / TORN / "run.yaml").write_text("[")
+    yield
+    for name in (RUN, TORN):
+        shutil.rmtree(served.data_dir / "runs" / name)
+
+
+@pytest.fixture
+def reader(browser: Browser, served: Any, shown: None) -> Iterator[Page]:
+    """A tab of somebody who may only look, which may not even ask for anything else."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(TIMEOUT_MS)
+    context.add_init_script(FEWER_PICTURES)
+    changes: list[str] = []
+
+    def note(request: Request) -> None:
+        path = urlsplit(request.url).path.removeprefix(urlsplit(served.base).path)
+        if not only_looks({"type": "http", "method": request.method, "path": path}):
+            changes.append(f"{request.method} {path}")
+
+    context.on("request", note)
+    page = context.new_page()
+    page.on("dialog", lambda dialog: dialog.accept())
+    page.goto(served.read_only_url)
+    yield page
+    page.wait_for_load_state()
+    context.close()
+    assert changes == []
+
+
+def test_what_only_some_may_do_is_offered_to_them_alone(
+    home: Page, reader: Page, served: Any
+) -> None:
+    pressed, found = 0, dict[str, set[str]]()
+    for page in (home, reader):
+        page.route(_EMPTY_SCENE, lambda route: route.fulfill(content_type="text/html"))
+    for path in PAGES:
+        offers: list[set[str]] = []
+        for page in (home, reader):
+            page.goto(f"{served.base}{path}")
+            offers.append(set(page.evaluate(_OFFERED, f"{_BUTTONS}, [role=button]")))
+            expect(page.locator("[data-only-looks]")).to_have_count(int(page is reader))
+        assert offers[1] <= offers[0], path
+        if only := offers[0] - offers[1]:
+            found[path] = only
+        reader.keyboard.press("n")  # Launches where that may be done.
+        pressed += reader.evaluate(_PRESS_ALL, _BUTTONS)
+        expect(reader.locator("#new")).to_have_count(0)
+    assert found == CHANGING
+    assert pressed > 100
+    reader.goto(served.base)
+    reader.locator("[data-only-looks]").hover()
+    expect(reader.locator("#tip")).to_contain_text("You may only look here.")
