@@ -30,6 +30,7 @@ def build() -> SubcommandApp:
         benchmark.gradient,
         benchmark.batch,
         benchmark.scaling,
+        benchmark.splats,
         benchmark.substeps,
         benchmark.live,
         benchmark.viewer,

@@ -119,6 +119,22 @@ def scaling(
     show(result, as_json=as_json)
 
 
+def splats(
+    *,
+    device: Device = "auto",
+    iterations: int | None = None,
+    as_json: AsJson = False,
+) -> None:
+    """Time pictures of splats and a fit of them, beside a loop over splats in NumPy.
+
+    Args:
+        iterations: Updates of a fit; none takes those of a default fit.
+    """
+    from physhandi.benchmarks.splats import benchmark_splats
+
+    show(benchmark_splats(device=pick_device(device), iterations=iterations), as_json=as_json)
+
+
 def substeps(
     run: RunName = "towel_fold_quick",
     *,

@@ -1,6 +1,6 @@
 """Settings of the fit of splats."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
@@ -37,6 +37,16 @@ class AppearanceConfig(Settings, frozen=True, kw_only=True):
     """Of the mean absolute difference to the measured depth [1/m]."""
     hand_margin: Annotated[int, Meta(ge=0, le=100)] = 3
     """Pixels around hands that are left out like hands, since masks end a little early [px]."""
+    outline_margin: Annotated[int, Meta(ge=0, le=100)] = 1
+    """Pixels on either side of the object's outline whose color is not compared, since masks are a
+    little wrong [px]."""
+    camera_rate: Annotated[float, Meta(ge=0.0, le=1.0)] = 1e-4
+    """First step by which cameras are moved against each other, since calibrations are a little
+    wrong, and a third of the one by which they are turned [rad]; it falls to a hundredth. 0 leaves
+    them where they are [m]."""
     renewal_interval: Annotated[int, Meta(ge=1, le=100_000)] = 100
     """Updates after which splats that cover next to nothing are moved to where the picture is
     wrong."""
+    rasteriser: Literal["auto", "built_in"] = "auto"
+    """What draws: ``auto`` takes gsplat on a GPU where it is installed, with which a fit does not
+    end with the same bits, and the built-in one elsewhere; ``built_in`` takes that everywhere."""

@@ -24,6 +24,7 @@ from torch import Tensor
 from physhandi.adam import Adam
 from physhandi.appearance.config import AppearanceConfig
 from physhandi.appearance.differentiable import draw_splats
+from physhandi.appearance.gsplat_backend import draw_splats_by_gsplat, is_installed
 from physhandi.appearance.recorded import RecordedObject, cut_out_object
 from physhandi.appearance.splats import Splats
 from physhandi.data.checkpoint import Checkpointer, resumed_note
@@ -41,7 +42,9 @@ _START_SCALE = 0.7
 """Standard deviation at first, in distances to the nearest splats."""
 _INVISIBLE = 0.02
 """Splats with less opacity are moved, and left out in the end."""
-_SMALLEST, _LARGEST = 0.1, 4.0
+_NEIGHBORS = 24
+"""Measured points around a splat through which a plane is laid."""
+_SMALLEST, _LARGEST = 0.45, 4.0
 """Bounds of standard deviations, in typical distances of splats."""
 _SPLIT = 0.8
 """Standard deviation of each of two splats that take the place of one, as a part of its own."""
@@ -101,9 +104,12 @@ def fit_splats(
     """
     progress, checkpointer = progress or NullProgress(), checkpointer or Checkpointer()
     progress.check_cancelled()
-    recorded = cut_out_object(views, frame, hand_margin=config.hand_margin)
+    recorded = cut_out_object(
+        views, frame, hand_margin=config.hand_margin, outline_margin=config.outline_margin
+    )
     target = [_Target(one, device) for one in recorded]
-    fit = _Fit(_first_splats(views, node, frame, surface, config.splat_count), config, device)
+    start = _first_splats(views, node, frame, surface, config.splat_count)
+    fit = _Fit(start, config, len(target), device)
     curve: list[float] = []
     state = checkpointer.load(APPEARANCE, fit.state(curve), growing=("curve",))
     if state is not None:
@@ -113,7 +119,7 @@ def fit_splats(
         )
     for iteration in range(len(curve), config.iterations):
         progress.check_cancelled()
-        curve.append(fit.update(target[iteration % len(target)], iteration))
+        curve.append(fit.update(target, iteration))
         checkpointer.offer(APPEARANCE, iteration + 1, lambda: fit.state(curve))
         progress.report(APPEARANCE, iteration + 1, config.iterations, curve[-1])
     return FittedSplats(splats=fit.splats(node), curve=np.array(curve, np.float64))
@@ -148,6 +154,7 @@ def _first_splats(
         measured = measured[KDTree(solid).query(measured)[0] < VOXEL]
     laid, shade = _on_surface(surface, node, _SAMPLES * count)
     center, is_laid = _thinned(measured, laid, count)
+    center[~is_laid] = _smoothed(center[~is_laid], measured)
     if not len(center):
         center, is_laid = node[:count].astype(np.float64), np.zeros(min(count, len(node)), bool)
     color = seen_colors(views, center, frame=frame)
@@ -226,6 +233,23 @@ def _thinned(
     return total / np.bincount(owner, weights=counts)[:, None], is_laid
 
 
+def _smoothed(
+    point: Float[ndarray, "point 3"], measured: Float[ndarray, "_ 3"]
+) -> Float[ndarray, "point 3"]:
+    """Move points onto the planes through what was measured around them, since depth is noisy.
+
+    From other sides than those of the cameras, splats at different depths would fall apart.
+    """
+    near = min(_NEIGHBORS, len(measured))
+    if near < 4 or not len(point):
+        return point
+    beside = measured[KDTree(measured).query(point, k=near)[1]]
+    middle = beside.mean(axis=1)
+    arm = beside - middle[:, None]
+    across = np.linalg.eigh(np.swapaxes(arm, 1, 2) @ arm)[1][:, :, 0]
+    return point - np.sum((point - middle) * across, axis=1, keepdims=True) * across
+
+
 def _voxels(point: Float[ndarray, "point 3"], edge: float) -> ndarray:
     return np.floor((point - point.min(axis=0)) / edge).astype(np.int64)
 
@@ -239,10 +263,11 @@ class _Target:
 
         self.camera = recorded.camera
         self.is_known = placed(recorded.is_known)
-        self.color = placed(recorded.color) * self.is_known[..., None]
+        self.color = placed(recorded.color) * placed(recorded.has_color)[..., None]
         self.alpha = placed(recorded.is_object).float()
         self.depth = placed(recorded.depth)
         self.has_depth = (self.depth > 0) & self.is_known
+        self.has_color = placed(recorded.has_color)
         # A mean over the object: however much black is around it, errors count alike.
         self.size = float(max(int((recorded.is_object & recorded.is_known).sum()), 1))
 
@@ -250,20 +275,31 @@ class _Target:
 class _Fit:
     """Splats that are being fitted."""
 
-    def __init__(self, start: _Start, config: AppearanceConfig, device: str) -> None:
+    def __init__(
+        self, start: _Start, config: AppearanceConfig, view_count: int, device: str
+    ) -> None:
         def leaf(value: ndarray) -> Tensor:
             return torch.tensor(value, dtype=torch.float32, device=device).requires_grad_()
 
         count = len(start.center)
         self._config, self._spacing = config, start.spacing
+        takes_gsplat = config.rasteriser == "auto" and device != "cpu" and is_installed()
+        self._draw = draw_splats_by_gsplat if takes_gsplat else draw_splats
         self.center, self.log_scale = leaf(start.center), leaf(np.log(start.scale))
         self.color = leaf(start.color)
         self.logit = leaf(np.full(count, math.log(_START_OPACITY / (1.0 - _START_OPACITY))))
+        # Each camera may be a little off from where its calibration says.
+        self._shift, self._turn = (leaf(np.zeros((view_count, 3))) for _ in range(2))
+        self._middle = self.center.detach().mean(dim=0)
         self._adam = {
             name: Adam(rates, betas=_BETAS)
             for name, rates in {
                 "center": [(self.center, config.center_rate * start.spacing)],
                 "color": [(self.color, config.color_rate)],
+                "camera": [
+                    (self._shift, config.camera_rate),
+                    (self._turn, 3.0 * config.camera_rate),
+                ],
                 "others": [
                     (self.log_scale, config.scale_rate),
                     (self.logit, config.opacity_rate),
@@ -272,16 +308,17 @@ class _Fit:
         }
         self._pull = torch.zeros(count, device=device)
 
-    def update(self, target: _Target, iteration: int) -> float:
-        """Compare with a view and move the splats; return the loss."""
+    def update(self, targets: Sequence[_Target], iteration: int) -> float:
+        """Compare with the view whose turn it is and move the splats; return the loss."""
         for adam in self._adam.values():
             adam.zero_grad()
-        loss = self._loss(target)
+        loss = self._loss(targets, iteration % len(targets))
         loss.backward()
         done = iteration / max(self._config.iterations - 1, 1)
         self._adam["center"].step(_LAST_CENTER_STEP**done)
         self._adam["color"].step(_LAST_COLOR_STEP**done)
         self._adam["others"].step()
+        self._adam["camera"].step(_LAST_CENTER_STEP**done)
         with torch.no_grad():
             self._pull += _gradient(self.center).norm(dim=1)
             bounds = (math.log(size * self._spacing) for size in (_SMALLEST, _LARGEST))
@@ -291,12 +328,16 @@ class _Fit:
                 self._renew()
         return float(loss.detach())
 
-    def _loss(self, target: _Target) -> Tensor:
-        config = self._config
-        color, alpha, depth = draw_splats(
-            target.camera, self.center, self.log_scale, self.color, self.logit
+    def _loss(self, targets: Sequence[_Target], view: int) -> Tensor:
+        config, target = self._config, targets[view]
+        # All cameras together stay where they are.
+        shift, turn = ((value - value.mean(dim=0))[view] for value in (self._shift, self._turn))
+        arm = self.center - self._middle
+        center = self.center + shift + torch.linalg.cross(turn.expand_as(arm), arm)
+        color, alpha, depth = self._draw(
+            target.camera, center, self.log_scale, self.color, self.logit
         )
-        color = color * target.is_known[..., None]
+        color = color * target.has_color[..., None]
         difference = (color - target.color).abs().sum() / (3.0 * target.size)
         unlike = (1.0 - _similarity(color, target.color)).sum() / (3.0 * target.size)
         loss = (1.0 - config.similarity) * difference + config.similarity * unlike
@@ -325,8 +366,8 @@ class _Fit:
             for rows in (dead, parent):
                 self.log_scale[rows] = (_SPLIT * size).log()
                 self.logit[rows] = half.clamp(1e-4, 1.0 - 1e-4).logit()
-            for adam in self._adam.values():
-                adam.forget(torch.cat([dead, parent]))
+            for name in ("center", "color", "others"):
+                self._adam[name].forget(torch.cat([dead, parent]))
         self._pull.zero_()
 
     def state(self, curve: Sequence[float]) -> dict[str, ndarray]:
