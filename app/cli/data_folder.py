@@ -6,7 +6,6 @@ from pathlib import Path
 
 from app.cli.lookup import read_settings
 from app.cli.output import AsJson, DataDir, show
-from app.exports.shares import Shares
 from app.jobs.catalog import Catalog
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.uploads import Uploads
@@ -16,7 +15,6 @@ from app.jobs.recovery.recovery import damaged_folders
 from app.jobs.scheduler import Scheduler, server_of
 from app.jobs.storage.retention import Retention
 from app.settings import ServerSettings
-from app.viewer.physics.presets import PresetStore
 from physhandi.data.run_folder import read_mapping
 from physhandi.errors import RunError
 
@@ -71,6 +69,10 @@ def look_through(data_dir: Path | None) -> Iterator[tuple[bool, str]]:
 
 
 def _other_problems(settings: ServerSettings) -> Iterator[str]:
+    # Every command imports this file; these import what draws.
+    from app.exports.shares import Shares
+    from app.viewer.physics.presets import PresetStore
+
     try:
         read_mapping(settings.launches_path)
     except RunError as error:
