@@ -56,7 +56,7 @@
   async function film(entry) {
     const link = await wholeLink();
         const query = new URLSearchParams(entry.dataset.sessionFilm);
-    if (link.camera_path && !query.has("turn")) query.set("camera_path", link.camera_path);
+    if (link.camera_path && !query.has("turn") && !query.has("beside")) query.set("camera_path", link.camera_path);
     await fetchSlowFile(`api/v1/runs/${scene.dataset.target}/export?${link.query}${link.query && "&"}${query}`, "Filming");
   }
 

@@ -234,6 +234,8 @@ def export(
     height: int = 720,
     turn: float = 0.0,
     camera_path: Path | None = None,
+    view: str = "",
+    beside: Literal["none", "recording", "difference"] | None = None,
     overwrite: bool = False,
     device: Device = "auto",
     data_dir: DataDir = None,
@@ -259,6 +261,11 @@ def export(
         turn: Angle in degrees by which the camera of a film goes round what it looks at.
         camera_path: JSON file with key frames that the camera of a film passes through
             (docs/formats.md).
+        view: Camera of the recording from which a film is taken, in that camera's size: object,
+            as splats where they were fitted, and hands. Without it, and with --beside, the camera
+            that the link looks from, else the first one.
+        beside: What is beside a film from a recorded camera: nothing, the recording, or that and
+            how much both differ.
         overwrite: Replace what is there.
     """
     from app.exports.shell import ExportOptions
@@ -275,6 +282,8 @@ def export(
         height=height,
         turn=turn,
         camera_path=camera_path,
+        view=view,
+        beside=beside,
         device=pick_device(device) if link else "cpu",
         overwrite=overwrite,
     )

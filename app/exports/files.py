@@ -17,7 +17,7 @@ from app.exports.cache import FileCache, FileJob
 from app.exports.links import CLOSED, address, read_query
 from app.exports.making import store_take
 from app.exports.permalink import state_from_query, state_to_query
-from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, FileRequest, Format
+from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, Beside, FileRequest, Format
 from app.exports.schema import MEDIA_TYPES, SlowFormat, errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
@@ -30,7 +30,7 @@ from physhandi.data.layout import SequenceFiles
 from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
 
-_OWN_FIELDS = ("format", "width", "height", "turn", "camera_path", "download")
+_OWN_FIELDS = ("format", "width", "height", "turn", "camera_path", "view", "beside", "download")
 _STORED = ("npz", "csv", "yaml")
 """Formats of what a run holds, which is written sooner than a process is started."""
 PictureSide = Annotated[
@@ -49,6 +49,13 @@ CameraPathField = Annotated[
     str,
     Query(max_length=50_000, description="Of films: the JSON of a camera path (docs/formats.md)."),
 ]
+FilmedFrom = Annotated[
+    str, Query(max_length=200, description="Of films: camera of the recording that takes it.")
+]
+_BESIDE = (
+    "Of films from a recorded camera, by default the one that the link looks from or the first: "
+    "what is beside it, nothing, the recording, or that and how much both differ."
+)
 LinkField = Annotated[
     str | None,
     Query(max_length=600, description="As in a link of the viewer; see the page's “Copy link”."),
@@ -67,6 +74,10 @@ class PictureOptions:
     """Angle by which the camera goes round [degrees]."""
     camera_path: CameraPathField = ""
     """How the camera of a film moves; docs/formats.md describes the JSON."""
+    view: FilmedFrom = ""
+    """Camera of the recording from which a film is taken."""
+    beside: Annotated[Beside | None, Query(description=_BESIDE)] = None
+    """What is beside such a film."""
 
 
 class FileProgress(BaseModel):

@@ -115,6 +115,21 @@ def make(
         as_html = order.format == "html"
         write_bytes(out, record_scene(content, take, state, report, as_html=as_html))
         return
+    if order.is_from_recorded_view:
+        from app.exports.recorded_film import film_recorded_view
+
+        film_recorded_view(
+            content,
+            take,
+            state,
+            report,
+            out,
+            as_gif=order.format == "gif",
+            view=order.view,
+            beside=order.beside or "none",
+            time_limit_s=time_limit_s,
+        )
+        return
     if order.format in {"mp4", "gif"}:
         from app.exports.movie import film_scene
 

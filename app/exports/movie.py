@@ -60,8 +60,30 @@ def film_scene(
     """
     if motion is not None:
         motion.check(content.frame_count, content.sequence_name)
+    frames = played_frames(content, state)
+    check_time(content, frames, size, time_limit_s)
+    pictures = _pictures(content, take, state, report, frames=frames, size=size, motion=motion)
+    film_of(pictures, out, rate=content.frame_rate * state.speed, size=size, as_gif=as_gif)
+
+
+def played_frames(content: Content, state: SessionState) -> range:
+    """List the frames of a sequence that are played."""
     first, last = state.part or (0, content.frame_count - 1)
-    frames = range(first, last + 1)
+    return range(first, last + 1)
+
+
+def check_time(content: Content, frames: range, size: tuple[int, int], time_limit_s: float) -> None:
+    """Refuse a film that would take longer than there is time.
+
+    Args:
+        content: What is filmed.
+        frames: Which frames.
+        size: Columns and rows [px].
+        time_limit_s: Time that there is [s].
+
+    Raises:
+        UsageError: If it would; says how large or long it may be.
+    """
     most_pixels = time_limit_s * FILMED_PIXELS_PER_SECOND / len(frames)
     if size[0] * size[1] > most_pixels:
         raise UsageError(
@@ -70,8 +92,28 @@ def film_scene(
             f"takes for a file. Choose at most {int(most_pixels):,} pixels or a shorter part "
             "(part=FIRST,LAST), or film it with 'physhandi export', which takes its time."
         )
-    pictures = _pictures(content, take, state, report, frames=frames, size=size, motion=motion)
-    rate = content.frame_rate * state.speed
+
+
+def film_of(
+    pictures: Iterator[UInt8[ndarray, "row column 3"]],
+    out: Path,
+    *,
+    rate: float,
+    size: tuple[int, int],
+    as_gif: bool,
+) -> None:
+    """Write pictures as a film, in one step or not at all.
+
+    Args:
+        pictures: Of equal size.
+        out: File to write.
+        rate: Pictures per second [Hz].
+        size: Their columns and rows [px].
+        as_gif: Whether to write a GIF instead of an MP4.
+
+    Raises:
+        UsageError: If it cannot be encoded.
+    """
     with replacing(out) as temporary:
         if as_gif:
             _write_gif(temporary, pictures, rate)

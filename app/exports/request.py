@@ -28,6 +28,9 @@ Format = Literal[
     "rrd",
     "splat-ply",
 ]
+Beside = Literal["none", "recording", "difference"]
+"""What is beside a film from a recorded camera: nothing, the recording, or that and how much both
+differ."""
 _SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip", "newton": "zip", "splat-ply": "ply"}
 """How the files of formats end, if not like the format."""
 SMALLEST, LARGEST = 16, 4_096
@@ -62,6 +65,11 @@ class FileRequest:
     """Angle by which the camera of a film goes round [degrees]."""
     camera_path: str = ""
     """How the camera of a film moves, as JSON; see `parse_camera_path`."""
+    view: str = ""
+    """Camera of the recording from which a film is taken; empty for the one that the link looks
+    from, else the first."""
+    beside: Beside | None = None
+    """Of a film from a recorded camera: what is beside it. None without `view` films the scene."""
     device: str = "cpu"
     """Warp device, if parameters were changed."""
     link: str = ""
@@ -72,6 +80,11 @@ class FileRequest:
         """How the file ends, without the dot."""
         is_one = self.format == "ply" and self.frame is not None
         return "ply" if is_one else _SUFFIXES.get(self.format, self.format)
+
+    @property
+    def is_from_recorded_view(self) -> bool:
+        """Whether a film is taken from one of the recording's cameras."""
+        return bool(self.view) or self.beside is not None
 
     @property
     def motion(self) -> CameraMotion | None:
@@ -104,6 +117,8 @@ class FileRequest:
             )
         if self.motion is not None and self.camera_path and self.format not in {"mp4", "gif"}:
             raise UsageError(f"camera_path: mp4 and gif have one, {self.format} has none.")
+        if self.is_from_recorded_view:
+            self._check_view()
         state = state_from_query(self.query)
         if self.format == "yaml" and state.is_changed:
             raise UsageError(
@@ -114,6 +129,15 @@ class FileRequest:
                 "fig: the comparison with PhysTwin is saved from a live scene, where it is shown."
             )
         return state
+
+    def _check_view(self) -> None:
+        if self.format not in {"mp4", "gif"}:
+            raise UsageError(
+                f"view, beside: mp4 and gif are filmed from a recorded camera, {self.format} is "
+                "not."
+            )
+        if self.turn or self.camera_path:
+            raise UsageError("view: a recorded camera stands where it stood; it has no turn.")
 
     def to_text(self) -> str:
         """Write the order on one line."""

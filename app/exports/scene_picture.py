@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Listing
 from typing import Any
 
 import cv2
@@ -12,16 +13,20 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from app.viewer.content.session_state import Pose
+from physhandi.appearance.rasterise import render_splats
+from physhandi.appearance.splats import Splats
 from physhandi.data.camera import PinholeCamera
-from physhandi.rendering.renderer import render
+from physhandi.rendering.renderer import rasterize, render
 from physhandi.rendering.shapes import Balls, Image, Segments, Shape, Surface, arrows, facets
 from physhandi.srgb import to_srgb
 
 BACKGROUND = {False: (255, 255, 255), True: (20, 21, 23)}
 """Behind everything, on light and dark pages."""
-_INK = {False: (30, 36, 44), True: (226, 230, 236)}
-_SKY = np.array([0.25, -0.35, 0.9])
-_SHADING = 0.4
+INK = {False: (30, 36, 44), True: (226, 230, 236)}
+"""Of what is written on them."""
+SKY = np.array([0.25, -0.35, 0.9])
+"""Direction from which the light comes."""
+SHADING = 0.4
 _WINDOW = 800.0
 """Rows of the window in which a line is as many pixels wide as viser says."""
 _NEAR = 1e-3
@@ -51,18 +56,45 @@ def draw_scene(
         The picture (red, green, blue).
     """
     view = _View(pose, width, height, is_dark=is_dark)
-    image = render(
-        view.camera,
-        [shape for node in _visible_nodes(server) for shape in view.shapes(*node)],
-        background=BACKGROUND[is_dark],
-        light=_SKY,
-        near=_NEAR * float(np.linalg.norm(pose.look_at - pose.position)),
-    )
+    shapes = [shape for node in _visible_nodes(server) for shape in view.shapes(*node)]
+    near = _NEAR * float(np.linalg.norm(pose.look_at - pose.position))
+    image = render(view.camera, shapes, background=BACKGROUND[is_dark], light=SKY, near=near)
     image = cv2.cvtColor(image, cv2.COLOR_RGBA2RGB)
+    groups = [node for node in _visible_nodes(server) if _is_splats(node[0])]
+    if groups:
+        drawn = render_splats(
+            view.camera,
+            _all_splats(groups),
+            background=image / np.float32(255.0),
+            occluder=rasterize(view.camera, shapes, near=near).depth.astype(np.float32),
+        )
+        image = np.rint(255.0 * drawn.color).astype(np.uint8)
     for node, _, position in _visible_nodes(server):
         if type(node).__name__ == "LabelHandle":
             view.write(image, node, position)
     return image
+
+
+def _is_splats(node: Any) -> bool:
+    return type(node).__name__ == "GaussianSplatHandle"
+
+
+def _all_splats(groups: Listing[tuple[Any, ndarray, ndarray]]) -> Splats:
+    """Collect the splats of nodes, which are equally wide in all directions."""
+    parts: list[tuple[ndarray, ...]] = []
+    for node, rotation, position in groups:
+        unit = float(node.scale)
+        center = _in_world(unit * node.centers, rotation, position)
+        parts.append(
+            (
+                center.astype(np.float32),
+                np.float32(unit) * np.sqrt(node.covariances[:, 0, 0]),
+                node.rgbs / np.float32(255.0),
+                node.opacities[:, 0] / np.float32(255.0),
+            )
+        )
+    center, scale, color, opacity = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Splats(center=center, scale=scale, color=color, opacity=opacity, rest_node=center[:1])
 
 
 def _visible_nodes(server: viser.ViserServer) -> Iterator[tuple[Any, ndarray, ndarray]]:
@@ -119,7 +151,7 @@ class _View:
             box = cv2.getTextSize((0, 0), line, (0, 0), font, size)
             x = int(place[0] - 0.5 * box[2])
             y = int(place[1] + (number - len(lines) / 2 + 0.8) * height)
-            cv2.putText(image, line, (x, y), _INK[self._is_dark], font, size)
+            cv2.putText(image, line, (x, y), INK[self._is_dark], font, size)
 
     def _wide(self, thickness: float) -> float:
         """Give the width of lines [px]."""
@@ -147,7 +179,7 @@ class _View:
             head_radius=float(node.head_radius),
             head_length=float(node.head_length),
             color=_colors(node.colors),
-            shading=_SHADING,
+            shading=SHADING,
         )
 
     def _mesh(self, node: Any, rotation: ndarray, position: ndarray) -> Iterator[Surface]:
@@ -164,7 +196,7 @@ class _View:
             # Behind the color of a mesh may be those of its vertices.
             color=color[1:] if len(color) > 1 else color,
             opacity=1.0 if node.opacity is None else float(node.opacity),
-            shading=_SHADING,
+            shading=SHADING,
         )
 
     def _meshes(self, node: Any, rotation: ndarray, position: ndarray) -> Iterator[Surface]:
@@ -180,7 +212,7 @@ class _View:
             vertex=placed.reshape(-1, 3),
             faces=(faces + first).reshape(-1, 3),
             color=np.repeat(color, len(vertex), axis=0),
-            shading=_SHADING,
+            shading=SHADING,
         )
 
     def _frustum(self, node: Any, rotation: ndarray, position: ndarray) -> Iterator[Shape]:

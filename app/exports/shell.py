@@ -10,6 +10,7 @@ from urllib.parse import parse_qsl, urlsplit
 from app.exports.files import request_of
 from app.exports.making import Report, carried_splats, make, surface_of
 from app.exports.permalink import state_from_query
+from app.exports.request import Beside
 from app.jobs.catalog import Catalog
 from app.viewer.content.camera_path import read_camera_path
 from physhandi.data.exporters import FORMATS, PLY, export_run
@@ -39,6 +40,10 @@ class ExportOptions:
     """Angle by which the camera of a film goes round [degrees]."""
     camera_path: Path | None = None
     """File that tells how the camera of a film moves."""
+    view: str = ""
+    """Camera of the recording from which a film is taken."""
+    beside: Beside | None = None
+    """What is beside such a film."""
     device: str = "cpu"
     """Warp device, if the link changes parameters."""
     overwrite: bool = False
@@ -80,6 +85,8 @@ def export(
         height=options.height,
         turn=options.turn,
         camera_path=_path_text(options.camera_path),
+        view=options.view,
+        beside=options.beside,
         device=options.device,
     )
     if options.format in FORMATS and not state.is_changed:

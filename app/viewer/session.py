@@ -154,6 +154,7 @@ class Session(SceneServer):
             "object": self._content.fitted is not None,
             "colors": self._colors.is_there,
             "figure": self._comparison.offers_figure,
+            "recorded": any(view.has_color for view in self._content.views),
             "video": default_layers(self._content).looks_from is not None,
         }
         return tuple(name for name, is_there in features.items() if is_there)

@@ -38,8 +38,8 @@ class SessionInfo:
     idle: float
     """Time since a browser was connected [s]."""
     offers: tuple[str, ...] = ()
-    """Features that it has: ``object`` (which can be simulated), ``colors``, ``figure``, ``video``
-    (behind the hands at first)."""
+    """Features that it has: ``object`` (which can be simulated), ``colors``, ``figure``,
+    ``recorded`` (a camera has pictures), ``video`` (behind the hands at first)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

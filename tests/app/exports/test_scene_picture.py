@@ -210,6 +210,47 @@ def test_a_grid_fades_away_and_lies_below_what_lies_on_it(
     assert (inside[..., 2] == 0).all()
 
 
+def add_splat(scene: Any, name: str, place: tuple[float, ...], color: Any, width: float) -> None:
+    """Add a splat with an opacity of 0.8 in a node that is elsewhere, turned and scaled."""
+    scene.add_gaussian_splats(
+        name,
+        np.array([[0.5, 0.0, 0.0]]),
+        np.eye(3)[None] * (2.0 * width) ** 2,
+        np.array([color]) / 255,
+        np.array([[0.8]]),
+        scale=0.5,
+        wxyz=(math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)),
+        position=np.array(place) - [0.0, 0.25, 0.0],
+    )
+
+
+def test_splats_cover_what_is_behind_them_by_their_opacity(
+    server: viser.ViserServer, scene: Any
+) -> None:
+    add_splat(scene, "/cloud/near", (0.0, 0.0, 1.0), RED, 0.1)
+    image = draw(server)
+    expected = 0.8 * np.array(RED) + 0.2 * 255
+    np.testing.assert_allclose(image[100, 100], expected, atol=4)
+    # One deviation aside, at a distance of 2 m; the nearest pixels are half a pixel off.
+    aside = 100 + round(0.1 / 2.0 * FOCAL * 200)
+    share = 0.8 * math.exp(-0.5)
+    np.testing.assert_allclose(image[100, aside, 0], share * 200 + (1 - share) * 255, atol=6)
+    np.testing.assert_allclose(image[100, aside, 1], share * 10 + (1 - share) * 255, atol=12)
+    assert (image[20, 20] == 255).all()
+
+
+def test_splats_and_surfaces_hide_each_other(server: viser.ViserServer, scene: Any) -> None:
+    wall = SQUARE + np.array([0.0, 1.0, 0.0], np.float32)
+    scene.add_mesh_simple("/wall", wall, QUAD, color=GRAY, side="double")
+    add_splat(scene, "/cloud/near", (0.0, 0.0, 1.0), RED, 0.1)
+    bare = draw(server)[100, 150]
+    image = draw(server)
+    np.testing.assert_allclose(image[100, 100], 0.8 * np.array(RED) + 0.2 * bare, atol=4)
+    scene.remove_by_name("/cloud/near")
+    add_splat(scene, "/cloud/far", (0.0, 2.0, 1.0), RED, 0.1)
+    np.testing.assert_allclose(draw(server)[100, 100], bare, atol=1)
+
+
 def test_labels_are_written_over_everything(server: viser.ViserServer, scene: Any) -> None:
     scene.add_mesh_simple("/wall", SQUARE, QUAD, color=(130, 130, 130), side="double")
     scene.add_label(

@@ -186,7 +186,7 @@ def test_hands_without_an_object_are_seen_before_the_first_video(
         client.until(lambda: {"/hand/right", "/cameras/view1"} <= set(client.nodes))
         assert not any(p.get("label") == "Preset" for p in client.gui.values())
         session = sessions.get(sessions.list()[0].id)
-        assert session.offers == ("video",)
+        assert session.offers == ("recorded", "video")
         assert set(session._tabs._tabs) == {"Play", "Look", "Inspect", "Export"}
         pose = Pose.first(session._server.initial_camera)
         camera = recording.sequence.views[0].camera
