@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.appearance.texture import colored_surface
 from physhandi.data.exporters.export import export_scene
 from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.layout import PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
@@ -18,7 +19,6 @@ from physhandi.data.sequence import Sequence as Recording
 from physhandi.data.view import View
 from physhandi.errors import PhysHandiError, UsageError
 from physhandi.fitting.stored_edits import read_edits
-from physhandi.metrics.photometric import seen_colors
 from physhandi.simulation.edits import Edits
 from physhandi.simulation.forces import (
     spring_strains,
@@ -30,7 +30,6 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.object_surface import ObjectSurface, lay_surface
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import NodeState, Restart, start_from_tensors
-from physhandi.triangles import vertex_normals
 
 logger = logging.getLogger(__name__)
 
@@ -349,14 +348,12 @@ def load_surface(
     )
     if surface is None:
         return None
-    vertex = surface.place(fitted.position[0]).astype(np.float64)
     try:
         seen = Recording.load(views).views if isinstance(views, Path) else views
-        color = seen_colors(seen, vertex, vertex_normals(vertex, surface.face))
+        return colored_surface(surface, fitted.position[0], seen)
     except PhysHandiError as error:  # What can be told of the object does not need a recording.
         logger.info("the surface of the object has no colors: %s", error)
         return surface
-    return replace(surface, color=color)
 
 
 def _difference(

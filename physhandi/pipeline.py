@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.appearance.scoring import add_picture_scores, picture_curves
 from physhandi.data.attempt import Attempt
 from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.environment import ENVIRONMENT, describe_environment
@@ -26,6 +27,7 @@ from physhandi.data.layout import (
     REST_NODE_FILE,
     SEARCH_FILE,
     SHAPE_FILE,
+    SPLATS_FILE,
     SequenceFiles,
 )
 from physhandi.data.observation import ObjectObservation
@@ -36,7 +38,9 @@ from physhandi.devices import describe_device
 from physhandi.errors import MissingInputError, RunError
 from physhandi.fitted_object import ROLLOUT, FittedObject
 from physhandi.fitting import artefacts
+from physhandi.fitting.appearance_fit import fit_appearance as fit_appearance
 from physhandi.fitting.checks.fit_warnings import with_warnings
+from physhandi.fitting.checks.readiness import colored_views as colored_views
 from physhandi.fitting.checks.readiness import (
     is_moved_by_hands,
     missing_for_hands,
@@ -44,6 +48,7 @@ from physhandi.fitting.checks.readiness import (
     readiness,
 )
 from physhandi.fitting.config import (
+    APPEARANCE,
     EVALUATION,
     HANDS,
     OBSERVATION,
@@ -85,7 +90,7 @@ from physhandi.fitting.stored_take import StoredTake
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.object_rollout import ObjectRollout
 from physhandi.perception.lifting import observe_object
-from physhandi.progress import Progress
+from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import changed_parameters
 from physhandi.simulation.restart import start_to_tensors
@@ -151,6 +156,8 @@ def reconstruct(
         _stage_refinement(
             sequences, problems, config, attempt, progress, device=device, keeper=keeper
         )
+    if config.appearance.enabled:
+        _stage_appearance(sequences, config, attempt, progress, device=device, keeper=keeper)
     return _stage_evaluation(sequences, config, attempt, progress, device, has_object=has_object)
 
 
@@ -198,7 +205,7 @@ def predict(
     node = artefacts.load_array(attempt.out / files.object_node)
     rollout = rule(node, artefacts.load_control(attempt.out, sequence.name))
     attempt.save_array(files.rollout, np.asarray(rollout, np.float32))
-    attempt.save_json(METRICS_FILE, {sequence.name: _measure(sequence, attempt)})
+    attempt.save_json(METRICS_FILE, {sequence.name: _measure(sequence, attempt, progress)})
     _finish(attempt, EVALUATION, [], [], [])
 
 
@@ -245,7 +252,10 @@ def simulate(
             _stage_simulation(source, sequences, (changes, edits), attempt, progress, device=device)
         else:
             _stage_take(source, sequences[0], stored, attempt, progress)
-    metrics = {sequence.name: _measure(sequence, attempt) for sequence in sequences}
+    metrics = {
+        sequence.name: _measure(sequence, attempt, progress, device=device)
+        for sequence in sequences
+    }
     attempt.save_json(METRICS_FILE, metrics)
     return metrics
 
@@ -276,8 +286,7 @@ def _stage_simulation(
         progress.report(SIMULATION, 0, count, message=f"{substeps} substeps a frame")
     rest_node = artefacts.load_rest_node(source.out)
     artefacts.save_object(attempt, parameters, rollouts[0].model, rest_node)
-    if source.has(SHAPE_FILE):
-        attempt.save_yaml(SHAPE_FILE, source.yaml(SHAPE_FILE))
+    _copy_look(source, attempt)
     for object_, rollout in zip(objects, rollouts, strict=True):
         rollout.parameters = rollout.parameters.replace(substeps_per_frame=substeps)
         artefacts.save_model(attempt, object_.sequence, rollout.model)
@@ -316,8 +325,7 @@ def _stage_take(
     artefacts.save_object(attempt, take.parameters, take.model, rest_node)
     artefacts.save_model(attempt, name, take.model)
     store_hands(source, stored, name, attempt)
-    if source.has(SHAPE_FILE):
-        attempt.save_yaml(SHAPE_FILE, source.yaml(SHAPE_FILE))
+    _copy_look(source, attempt)
     if contacts is not None:
         attempt.save_tensors(files.contacts, contacts.to_tensors())
     attempt.save_array(files.attachment, attachment)
@@ -326,6 +334,14 @@ def _stage_take(
     # Its markers are the object's nodes, simulated when it was made.
     attempt.save_array(files.rollout, marker)
     _finish(attempt, SIMULATION, [], [], [])
+
+
+def _copy_look(source: RunFolder, attempt: Attempt) -> None:
+    """Copy what is known of the object besides its springs: its kind, and its splats."""
+    if source.has(SHAPE_FILE):
+        attempt.save_yaml(SHAPE_FILE, source.yaml(SHAPE_FILE))
+    if source.has(SPLATS_FILE):
+        attempt.save_tensors(SPLATS_FILE, source.tensors(SPLATS_FILE))
 
 
 def _object_in(
@@ -400,7 +416,8 @@ def predict_again(
     _store_restart(attempt, sequence, device, ObjectFitConfig())
     fitted = _stored_object(attempt, sequence)
     _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
-    attempt.save_json(METRICS_FILE, {sequence.name: _measure(sequence, attempt)})
+    measured = _measure(sequence, attempt, progress, device=device)
+    attempt.save_json(METRICS_FILE, {sequence.name: measured})
 
 
 def _stored_object(attempt: Attempt, sequence: Sequence) -> FittedObject:
@@ -430,14 +447,31 @@ def _store_rollout(
     attempt.save_array(SequenceFiles(object_.sequence).rollout, np.asarray(rollout.position))
 
 
-def evaluate(run: RunFolder, sequences: Many[Sequence]) -> dict[str, Any]:
-    """Measure a finished run against its sequences again."""
+def evaluate(
+    run: RunFolder,
+    sequences: Many[Sequence],
+    progress: Progress | None = None,
+    *,
+    draws: bool = True,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Measure a finished run against its sequences again.
+
+    Args:
+        run: The run.
+        sequences: Its recordings.
+        progress: Told about every frame that is drawn.
+        draws: Whether pictures are compared too, if the run holds splats.
+        device: Warp device that draws.
+    """
     scores = {}
     for sequence in sequences:
         points = None
         if not run.has(SequenceFiles(sequence.name).observation("hand_point")):
             points = artefacts.lifted_hand_points(sequence)
         measured = score_run(run.out, sequence, hand_points=points)
+        if draws:
+            _compare_pictures(measured, run.out, sequence, progress or NullProgress(), device)
         scores[sequence.name] = with_warnings(run.out, sequence, measured)
     return scores
 
@@ -683,6 +717,38 @@ def _stage_refinement(
     _finish(attempt, REFINEMENT, before, after, curve)
 
 
+def _stage_appearance(
+    sequences: Many[Sequence],
+    config: PipelineConfig,
+    attempt: Attempt,
+    progress: Progress,
+    *,
+    device: str,
+    keeper: Keeper,
+) -> None:
+    """What the object looks like: splats, fitted to frame 0 of the first sequence."""
+    if attempt.stage_done(APPEARANCE):
+        return
+    found = readiness(sequences, config)[APPEARANCE]
+    if not found.is_ready:
+        _finish(attempt, APPEARANCE, [], [], [], note=f"Left out: {found.why}.")
+        return
+    fitted = fit_appearance(
+        attempt.out,
+        sequences[0],
+        config.appearance,
+        progress,
+        device=device,
+        checkpointer=keeper(),
+    )
+    attempt.save_tensors(SPLATS_FILE, fitted.splats.to_tensors())
+    curve = [[float(iteration), float(loss)] for iteration, loss in enumerate(fitted.curve)]
+    # Each update looks at one view, so losses are means over all of them.
+    count = len(colored_views(sequences[0]))
+    before, after = fitted.curve[:count].mean(), fitted.curve[-count:].mean()
+    _finish(attempt, APPEARANCE, [float(before)], [float(after)], curve)
+
+
 def _stage_evaluation(
     sequences: Many[Sequence],
     config: PipelineConfig,
@@ -707,18 +773,37 @@ def _stage_evaluation(
                     progress.report(EVALUATION, number, len(sequences), message=told)
             fitted = _stored_object(attempt, sequence)
             _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
-        metrics[sequence.name] = _measure(sequence, attempt)
+        metrics[sequence.name] = _measure(sequence, attempt, progress, device=device)
         progress.report(EVALUATION, number + 1, len(sequences))
     attempt.save_json(METRICS_FILE, metrics)
     _finish(attempt, EVALUATION, [], [], [])
     return metrics
 
 
-def _measure(sequence: Sequence, attempt: Attempt) -> dict[str, Any]:
+def _measure(
+    sequence: Sequence, attempt: Attempt, progress: Progress, *, device: str = "cpu"
+) -> dict[str, Any]:
     """Score one sequence, and store the error of every frame for charts."""
     scores, frames = measure_run(attempt.out, sequence)
+    _compare_pictures(scores, attempt.out, sequence, progress, device)
     attempt.save_json(SequenceFiles(sequence.name).frame_errors, frames)
     return with_warnings(attempt.out, sequence, scores)
+
+
+def _compare_pictures(
+    scores: dict[str, Any], out: Path, sequence: Sequence, progress: Progress, device: str
+) -> None:
+    """Add what pictures of the rollout score, if it is known what the object looks like."""
+    splats = artefacts.load_splats(out)
+    if splats is None:
+        return
+    rollout = artefacts.load_array(out / SequenceFiles(sequence.name).rollout)
+    curves = picture_curves(sequence, rollout, splats, progress, stage=EVALUATION, device=device)
+    splits = {
+        "reconstruction": sequence.reconstruction_frames,
+        "future": sequence.future_frames,
+    }
+    add_picture_scores(scores, curves, splits)
 
 
 def _finish(

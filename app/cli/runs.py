@@ -22,7 +22,7 @@ from app.jobs.order import default_name, fit_settings
 from app.jobs.processes import WORKER
 from app.settings import LOCAL
 from physhandi.api import prepare_run
-from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE
+from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE, SPLATS_FILE
 from physhandi.data.run import RunKind
 from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence import Sequence
@@ -180,14 +180,18 @@ def simulate(
 
 
 def evaluate_run(
-    run: Positional[str], *, as_json: AsJson = False, data_dir: DataDir = None
+    run: Positional[str],
+    *,
+    as_json: AsJson = False,
+    device: Device = "auto",
+    data_dir: DataDir = None,
 ) -> None:
-    """Measure a run against its sequences.
+    """Measure a run against its sequences; a run with splats is drawn in every view.
 
     Args:
         run: Folder or id of a finished run.
     """
-    show(_measured(run, data_dir), as_json=as_json)
+    show(_measured(run, data_dir, draws=True, device=device), as_json=as_json)
 
 
 def evaluate_hands(
@@ -198,7 +202,7 @@ def evaluate_hands(
     Args:
         run: Folder or id of a finished run.
     """
-    measured = _measured(run, data_dir)
+    measured = _measured(run, data_dir, draws=False)
     hands = {name: scores["hands"] for name, scores in measured.items() if scores.get("hands")}
     if not hands:
         raise RunError(f"Run '{run}' has no hands to measure.")
@@ -331,11 +335,21 @@ def gallery(
     print(index)
 
 
-def _measured(run: str, data_dir: Path | None) -> dict[str, Any]:
+def _measured(
+    run: str, data_dir: Path | None, *, draws: bool, device: str = "cpu"
+) -> dict[str, Any]:
     from physhandi import pipeline
 
     finished = find_result(run, data_dir)
-    return pipeline.evaluate(finished, open_catalog(data_dir).sequences_of(finished))
+    sequences = open_catalog(data_dir).sequences_of(finished)
+    with watched(True) as progress:
+        return pipeline.evaluate(
+            finished,
+            sequences,
+            progress,
+            draws=draws,
+            device=pick_device(device) if finished.has(SPLATS_FILE) else "cpu",
+        )
 
 
 def _new_folder(data_dir: Path | None) -> Path:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -46,6 +46,9 @@ def evaluate_suite(
     sequences: Annotated[
         tuple[str, ...], arg(help_behavior_hint="(default: the suite's scenes)")
     ] = (),
+    splats: Annotated[
+        int | None, arg(help_behavior_hint="(default: as many as a fit takes)")
+    ] = None,
     out: Path | None = None,
     jobs: Annotated[int | None, arg(help_behavior_hint="(default: one each device)")] = None,
     device: Devices = "auto",
@@ -66,6 +69,8 @@ def evaluate_suite(
             their spread; a search is also luck.
         protocols: main is reconstruction and future prediction.
         sequences: Folders or names of sequences to evaluate in place of the suite's scenes.
+        splats: Most splats that show what an object looks like, for PSNR, SSIM and IoU of pictures;
+            they are fitted once a sequence that has color and masks. 0 compares no pictures.
         out: Folder to fill, and to go on with; none takes one of its own in `suites/` of the data
             folder, whose suites the server shows.
         jobs: How many sequences and cells are computed side by side, each in a process of its own;
@@ -96,11 +101,12 @@ def evaluate_suite(
         "seeds": seeds,
         "search-seeds": search_seeds,
         "protocols": protocols,
+        "splats": () if splats is None else (splats,),
     }
     chosen = find_suite(suite or "tiny")
     if sequences and seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
-    settings = chosen.settings if suite or not sequences else NAMED_SETTINGS
+    settings = _with_splats(chosen.settings if suite or not sequences else NAMED_SETTINGS, splats)
     methods = methods or chosen.methods
     for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
         for one in searched_from(parse_method(method), search_seeds):
@@ -168,6 +174,22 @@ def _checked_jobs(jobs: int | None, places: int, *, is_here: bool) -> int:
     if not 1 <= jobs <= most:
         raise UsageError(f"--jobs {jobs} makes no sense; choose 1 to {most}.")
     return jobs
+
+
+def _with_splats(settings: Mapping[str, Any], count: int | None) -> dict[str, Any]:
+    """Say how many splats show what an object looks like.
+
+    Raises:
+        UsageError: If there cannot be so many.
+    """
+    from physhandi.fitting.config import PipelineConfig, apply_overrides
+    from physhandi.synthetic.suite.methods import LOOK
+
+    if count is None:
+        return dict(settings)
+    asked = {f"{LOOK}splat_count": count} if count else {f"{LOOK}enabled": False}
+    apply_overrides(PipelineConfig(), asked)
+    return {**settings, **asked}
 
 
 def _name_for(sequences: list[Sequence]) -> str:

@@ -17,16 +17,21 @@ from physhandi.data.environment import ENVIRONMENT, processor_name
 from physhandi.data.files import named_fields
 from physhandi.data.run_folder import CURRENT, EXIT, moment_of, read_mapping
 from physhandi.errors import PhysHandiError, RunError, UsageError
-from physhandi.fitting.checks.readiness import missing_for_hands, missing_for_object
+from physhandi.fitting.checks.readiness import (
+    colored_views,
+    missing_for_hands,
+    missing_for_object,
+)
 from physhandi.fitting.config import (
+    APPEARANCE,
     EVALUATION,
     HANDS,
     OBSERVATION,
     REFINEMENT,
     SEARCH,
     SPRINGS,
-    STAGES,
     PipelineConfig,
+    planned_stages,
 )
 from physhandi.run import Run
 
@@ -41,6 +46,10 @@ _DEPTH_COST = 15.0
 """Cost of an update of the hand with depth, in updates without (measured: 14 to 18)."""
 _GRADIENT_COST = 3.0
 """Cost of a gradient, in simulations."""
+_PICTURE_COST = 5.0
+"""Cost of drawing and comparing a frame in all views, in frames that are evaluated without."""
+_TYPICAL = {APPEARANCE: [8e-5]}
+"""Time per unit of work, on two cores, of stages that a fit may be the first to have [s]."""
 _NODE_COST = 6.0
 """Cost of a node in a substep, in springs."""
 _LEAST_SUBSTEPS = 120.0
@@ -60,6 +69,8 @@ class Extent:
     """Number of sequences."""
     has_object: bool
     """Whether every sequence shows an object to fit."""
+    has_look: bool = False
+    """Whether the first sequence shows what the object looks like."""
 
     @classmethod
     def of(cls, sequences: Sequence[recordings.Sequence]) -> "Extent":
@@ -69,6 +80,7 @@ class Extent:
             sum(s.frame_count for s in sequences if not missing_for_hands(s)),
             len(sequences),
             not any(missing_for_object(sequence) for sequence in sequences),
+            bool(colored_views(sequences[0])),
         )
 
 
@@ -87,12 +99,18 @@ def work_of(config: PipelineConfig, extent: Extent) -> dict[str, float]:
     rollout = _frame_cost(config) * extent.frames
     refined = _frame_cost(config) * extent.hand_frames * config.refinement.iterations
     springs = config.object_.first_order.iterations
-    return hands | {
+    work = hands | {
         OBSERVATION: float(extent.frames),
         SEARCH: rollout * (1 + search.generations * population),
         SPRINGS: rollout * (1 + springs * (1 + _GRADIENT_COST)),
         REFINEMENT: refined * (1 + _GRADIENT_COST),
-        EVALUATION: float(extent.frames),
+    }
+    if not config.appearance.enabled:
+        return work | {EVALUATION: float(extent.frames)}
+    look = config.appearance
+    return work | {
+        APPEARANCE: float(look.iterations * look.splat_count * extent.has_look),
+        EVALUATION: extent.frames * (1 + _PICTURE_COST * extent.has_look),
     }
 
 
@@ -166,7 +184,8 @@ def expect(
         work: Its work, see `work_of`.
 
     Returns:
-        None if a stage that has work was never measured.
+        None if a stage that has work was never measured; of those that few fits have, a typical
+        time stands in.
     """
     own, profile = _values_of(settings), settings.get("profile")
     same = [fit for fit in fits if fit.machine == machine and fit.settings == own]
@@ -184,7 +203,7 @@ def expect(
             seconds[stage] = 0.0
             continue
         rates_of_groups = [_rates(group, stage) for group in groups]
-        rates = next((rates for rates in rates_of_groups if rates), None)
+        rates = next((rates for rates in rates_of_groups if rates), _TYPICAL.get(stage))
         if rates is None:
             return None
         seconds[stage] = amount * statistics.median(rates)
@@ -199,7 +218,13 @@ def _rates(fits: Sequence[FinishedFit], stage: str) -> list[float]:
 
 
 def _values_of(settings: Mapping[str, Any]) -> str:
-    values = {key: v for key, v in settings.items() if key not in {"profile", "description"}}
+    """Give settings as JSON; those that are newer than a run have the values that it was made with.
+
+    Such are their defaults, as everywhere where a run says nothing of them.
+    """
+    config = _config_of(settings)
+    whole = settings if config is None else config.to_dict()
+    values = {key: v for key, v in whole.items() if key not in {"profile", "description"}}
     return json.dumps(values, sort_keys=True, default=str)
 
 
@@ -472,11 +497,12 @@ def _position_of(run: Run, begin: float, now: float) -> Position:
             raise RunError(f"Run '{run.id}' does not tell when {stage['name']} ended.")
         finished[str(stage["name"])] = float(stage.get("seconds", 0.0)) if ended > begin else 0.0
         stage_begin = max(stage_begin, ended)
-    current = next((name for name in STAGES if name not in finished), "")
+    planned = planned_stages(run.config.get("profile"))
+    current = next((name for name in planned if name not in finished), "")
     report = run.progress
     is_current = report.get("attempt") == run.attempt and report.get("stage") == current
     # Of several sequences most stages count anew for each one, so counting shows no share there.
-    is_counted_once = len(run.sequences) == 1 or current in {SEARCH, SPRINGS}
+    is_counted_once = len(run.sequences) == 1 or current in {SEARCH, SPRINGS, APPEARANCE}
     share = _share_of(run, report) if is_current and is_counted_once else None
     reported = float(report["time"]) if share is not None else stage_begin
     return Position(finished, current, share, max(0.0, reported - stage_begin), now - stage_begin)

@@ -27,7 +27,7 @@ from physhandi.data.run_folder import (
     read_mapping,
 )
 from physhandi.errors import PhysHandiError, describe
-from physhandi.fitting.config import SIMULATION, STAGES
+from physhandi.fitting.config import SIMULATION, planned_stages
 from physhandi.run import Run
 
 PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
@@ -217,12 +217,12 @@ def stages_of(run: Run, state: str) -> list[dict[str, Any]]:
         state: State of the run, as the queue knows it.
     """
     if run.attempt is None:
-        return [asdict(StageView(name, "to-come")) for name in _names(run.kind)]
+        return [asdict(StageView(name, "to-come")) for name in _names(run)]
     finished = run.stages()
     progress = run.progress
     is_current = progress.get("attempt") == run.attempt
     latest = str(progress["stage"]) if is_current else None
-    views = stage_views(_names(run.kind), finished, state, latest)
+    views = stage_views(_names(run), finished, state, latest)
     begun = _running_since(run, finished)
     now = datetime.now(UTC).timestamp()
     return [
@@ -288,8 +288,9 @@ def _has_worked(name: str, finished: Mapping[str, Any]) -> bool:
     return any("/hand_" in file for file in files)
 
 
-def _names(kind: str) -> list[str]:
-    return [SIMULATION] if kind == "simulation" else list(STAGES)
+def _names(run: Run) -> Sequence[str]:
+    is_fit = run.kind != "simulation"
+    return planned_stages(run.config.get("profile")) if is_fit else [SIMULATION]
 
 
 def _running_since(run: Run, finished: Sequence[Mapping[str, Any]]) -> float | None:

@@ -4,6 +4,7 @@ from typing import Any, cast
 
 from app.pages.render import short, words
 from physhandi.data.files import named_fields
+from physhandi.settings import flatten
 
 METHOD_TEXTS = {
     "rollout": "The fitted object, simulated from frame 0 on with the motion of the hand.",
@@ -17,6 +18,13 @@ _SHARES = {"accuracy", "iou", "precision", "recall", "f1", "share"}
 _LENGTHS = {"chamfer", "error", "mpjpe", "mpvpe", "distance", "spacing", "resolution", "radius"}
 _COUNTS = {"frames", "count", "scored", "seed", "keypoints"}
 _ABOUT = (
+    ("phystwin_psnr", "As PhysTwin: first view, whole image with its black background."),
+    ("phystwin_ssim", "As PhysTwin: first view, whole image with its black background."),
+    ("phystwin_iou", "As PhysTwin: first view, any trace of the picture counts as covered."),
+    ("psnr", "Pictures against the recording, only where the object or its picture is."),
+    ("ssim", "Structural similarity of pictures, only where the object or its picture is."),
+    ("proper_iou", "Silhouettes of picture and mask, without the hands, in all views."),
+    ("held_out_iou", "Silhouettes of picture and mask, in views that no fit saw."),
     ("chamfer_dynamic", "Only over observed points that move more than 10 mm from frame 0."),
     ("chamfer_truth_to_nodes", "From each point of the true surface to the nearest node."),
     ("chamfer_nodes_to_truth", "From each node of the surface to the true surface."),
@@ -74,6 +82,7 @@ def tabulate(scores: Any) -> dict[str, Any]:
         facts = {key: v for key, v in inside.items() if key not in columns and key != "unit"}
         if not columns:
             columns, facts = {"value": facts}, {}
+        columns = {key: _in_one_row(column) for key, column in columns.items()}
         rows = _rows(columns, str(inside.get("unit", unit)))
         facts |= {
             key: value
@@ -85,6 +94,11 @@ def tabulate(scores: Any) -> dict[str, Any]:
         heads = [{"name": key, "about": METHOD_TEXTS.get(key, "")} for key in columns]
         tables.append({"name": name, "note": note, "columns": heads, "rows": rows})
     return {"tables": tables, "notes": notes}
+
+
+def _in_one_row(column: dict[str, Any]) -> dict[str, Any]:
+    """Join the names of scores that belong together, such as those of pictures."""
+    return {path.replace(".", "_"): value for path, value in flatten(column).items()}
 
 
 def scaled(value: Any, unit: str) -> tuple[Any, str]:
@@ -127,7 +141,8 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
 
 def about_quantity(name: str) -> str:
     """Tell what a quantity means; empty if its name says it all."""
-    return next((text for start, text in _ABOUT if start in name), "")
+    joined = name.replace(".", "_")
+    return next((text for start, text in _ABOUT if start in joined), "")
 
 
 def is_better_when_higher(parts: set[str]) -> bool:
@@ -156,6 +171,8 @@ def unit_of_metric(parts: set[str], unit: str) -> str:
         return "share"
     if "reprojection" in parts:
         return "px"
+    if "psnr" in parts:
+        return "dB"
     return unit if parts & _LENGTHS else ""
 
 

@@ -19,6 +19,8 @@ _SPELLINGS = {
     "l2": "L2",
     "f1": "F1",
     "iou": "IoU",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
     "rrd": "RRD",
     "mpjpe": "MPJPE",
     "phystwin": "PhysTwin",

@@ -6,6 +6,8 @@ from msgspec import Meta
 
 from physhandi.settings import Settings
 
+APPEARANCE = "appearance"
+"""Name of the stage."""
 _Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 _Rate = Annotated[float, Meta(ge=1e-9, le=1.0)]
 _Weight = Annotated[float, Meta(ge=0.0, le=1e6)]

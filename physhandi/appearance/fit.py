@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from physhandi.adam import Adam
-from physhandi.appearance.config import AppearanceConfig
+from physhandi.appearance.config import APPEARANCE, AppearanceConfig
 from physhandi.appearance.differentiable import draw_splats
 from physhandi.appearance.gsplat_backend import draw_splats_by_gsplat, is_installed
 from physhandi.appearance.recorded import RecordedObject, cut_out_object
@@ -35,8 +35,6 @@ from physhandi.perception.lifting import OBJECT_LABEL, VOXEL, fuse, surface_poin
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.object_surface import ObjectSurface
 
-APPEARANCE = "appearance"
-"""What the fit is called where its progress is told and its state is kept."""
 _START_OPACITY = 0.6
 _START_SCALE = 0.7
 """Standard deviation at first, in distances to the nearest splats."""

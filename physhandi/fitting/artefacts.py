@@ -12,9 +12,16 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from safetensors.numpy import load_file
 
+from physhandi.appearance.splats import Splats
 from physhandi.data.attempt import Attempt
 from physhandi.data.files import named_fields, parse_yaml, read_array
-from physhandi.data.layout import MATERIAL_FILE, PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
+from physhandi.data.layout import (
+    MATERIAL_FILE,
+    PARAMETERS_FILE,
+    SHAPE_FILE,
+    SPLATS_FILE,
+    SequenceFiles,
+)
 from physhandi.data.observation import ObjectObservation, thinned
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
@@ -271,6 +278,19 @@ def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:
     path = out / MATERIAL_FILE
     with reading(path):
         return load_file(path)["rest_node"]
+
+
+def load_splats(out: Path) -> Splats | None:
+    """Read what the object looks like; None if that was not fitted.
+
+    Raises:
+        RunError: If the file is damaged.
+    """
+    path = out / SPLATS_FILE
+    if not path.is_file():
+        return None
+    with reading(path):
+        return Splats.from_tensors(load_file(path))
 
 
 def save_model(output: Attempt, name: str, model: SpringMassModel) -> None:

@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal, cast
 import yaml
 from msgspec import Meta, field
 
+from physhandi.appearance.config import APPEARANCE as APPEARANCE
+from physhandi.appearance.config import AppearanceConfig
 from physhandi.data.files import named_fields, parse_yaml
 from physhandi.errors import SettingsError, UsageError
 from physhandi.settings import (
@@ -38,7 +40,7 @@ HANDS, OBSERVATION, SEARCH, SPRINGS, REFINEMENT, EVALUATION = (
     "evaluation",
 )
 STAGES = (HANDS, OBSERVATION, SEARCH, SPRINGS, REFINEMENT, EVALUATION)
-"""Stages of a reconstruction."""
+"""Stages of every reconstruction; see `planned_stages`."""
 SIMULATION = "simulation"
 """The first stage of a simulation."""
 
@@ -392,8 +394,22 @@ class PipelineConfig(Settings, frozen=True, kw_only=True):
     """Stage 3."""
     prediction: PredictionConfig = field(default_factory=PredictionConfig)
     """The frames after the fitted ones."""
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    """What the object looks like, which is fitted last of all."""
     simulation: SimulationParameters = field(default_factory=SimulationParameters)
     """Values that the search starts from, and all that are not searched."""
+
+
+def planned_stages(settings: Any) -> tuple[str, ...]:
+    """List the stages of a reconstruction: `APPEARANCE` is one only if its settings ask for it.
+
+    Args:
+        settings: Settings in plain data, as a run stores them; damaged ones ask for nothing.
+    """
+    appearance = named_fields((named_fields(settings) or {}).get("appearance")) or {}
+    if appearance.get("enabled") is not True:
+        return STAGES
+    return (*STAGES[:-1], APPEARANCE, EVALUATION)
 
 
 PROFILES = Path(__file__).parent / "profiles"
@@ -565,6 +581,7 @@ GROUPS = {
     "object_.first_order": "Stage 2: springs one by one",
     "refinement": "Stage 3: hands again",
     "prediction": "Predicted frames",
+    "appearance": "What the object looks like",
 }
 """Settings that belong together, by the path that they share."""
 FROM_SEQUENCE = ("simulation.frame_rate", "simulation.ground_height")

@@ -14,10 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from physhandi.data.camera import PinholeCamera
 from physhandi.data.view import View
 from physhandi.metrics.geometry import nearest_node
-from physhandi.metrics.topology import resolution
 
 OBJECT = 1
 """Mask value of the object; larger values are hands."""
@@ -25,8 +23,6 @@ LEAST_ALPHA = 0.5
 """Least alpha of a pixel that a picture is taken to cover, by the proper definition."""
 WINDOW, SIGMA = 11, 1.5
 """Width of the window in which SSIM compares, and deviation of its Gaussian weights [px]."""
-DISC = 0.75
-"""Radius of a drawn node, in distances between nodes: neighbouring discs overlap."""
 _C1, _C2 = 0.01**2, 0.03**2
 _LEAST_ERROR = 1e-10
 _BEHIND = 0.015
@@ -78,7 +74,7 @@ def phystwin_scores(
     shown = _on_black(np.rint(_FULL * np.clip(color, 0.0, 1.0)) / _FULL, ~is_hand)
     # Where windows hold nothing but black in both, the similarity is 1.
     rows, columns = _box(np.asarray((seen + shown).any(axis=2)))
-    similarity = ssim_map(seen[rows, columns], shown[rows, columns])
+    similarity = structural_similarity(seen[rows, columns], shown[rows, columns])
     missing = float(np.sum(1.0 - similarity.mean(axis=2)))
     return ImageScores(
         psnr=psnr(((seen - shown) ** 2).mean()), ssim=1.0 - missing / mask.size, iou=iou
@@ -116,7 +112,7 @@ def proper_scores(
     counted = is_counted[rows, columns]
     seen = _on_black(recorded[rows, columns] / _FULL, is_object[rows, columns])
     shown = _on_black(np.clip(color[rows, columns], 0.0, 1.0), counted)
-    similarity = ssim_map(seen, shown)[counted]
+    similarity = structural_similarity(seen, shown)[counted]
     return ImageScores(
         psnr=psnr(((seen - shown)[counted] ** 2).mean()),
         ssim=float(similarity.mean()),
@@ -129,7 +125,7 @@ def psnr(squared_error: float) -> float:
     return -10.0 * float(np.log10(max(squared_error, _LEAST_ERROR)))
 
 
-def ssim_map(
+def structural_similarity(
     first: Float[ndarray, "row column channel"], second: Float[ndarray, "row column channel"]
 ) -> Float[ndarray, "row column channel"]:
     """Compute the structural similarity around each pixel (Wang et al. 2004), each channel apart.
@@ -229,98 +225,3 @@ def seen_colors(
         return None
     nearest = colored[nearest_node(node, node[colored])]
     return (total[nearest] / count[nearest, None]).round().astype(np.uint8)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Drawing:
-    """Nodes as a camera sees them."""
-
-    image: UInt8[ndarray, "row column 3"]
-    """Colors on black."""
-    is_covered: Bool[ndarray, "row column"]
-    """Pixels that a disc covers."""
-
-
-def draw_nodes(
-    camera: PinholeCamera,
-    node: Float[ndarray, "node 3"],
-    color: UInt8[ndarray, "node 3"],
-    radius: float,
-) -> Drawing:
-    """Draw nodes as discs, from the farthest to the nearest.
-
-    Args:
-        camera: The camera.
-        node: Nodes [m]; those behind the camera are left out.
-        color: Color of each of them.
-        radius: Radius of a disc in the world [m].
-    """
-    image = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
-    covered = np.zeros((camera.height, camera.width), dtype=np.uint8)
-    depth = camera.camera_depth(node)
-    pixel = np.nan_to_num(camera.project(node), nan=-1e4)
-    size = radius * float(camera.K[0, 0]) / np.maximum(depth, 1e-6)
-    for index in np.argsort(-depth):
-        if depth[index] <= 0 or not np.abs(pixel[index]).max() < 1e4:
-            continue
-        center = (round(float(pixel[index, 0])), round(float(pixel[index, 1])))
-        width = max(1, round(float(size[index])))
-        red, green, blue = (int(value) for value in color[index])
-        cv2.circle(image, center, width, (red, green, blue), -1)
-        cv2.circle(covered, center, width, (1,), -1)
-    return Drawing(image=image, is_covered=covered > 0)
-
-
-def silhouette_iou(drawing: Drawing, mask: UInt8[ndarray, "row column"]) -> float:
-    """Compute intersection over union of the object outside the hands; NaN if both are empty."""
-    is_object = mask == OBJECT
-    drawn = drawing.is_covered & (mask <= OBJECT)
-    either = int((is_object | drawn).sum())
-    return int((is_object & drawn).sum()) / either if either else float("nan")
-
-
-def shaded_psnr(
-    drawing: Drawing, color: UInt8[ndarray, "row column 3"], mask: UInt8[ndarray, "row column"]
-) -> float:
-    """Compute the PSNR of the object on black over the whole image, hands left out of both [dB].
-
-    This is PhysTwin's protocol, in which the black background counts.
-    """
-    observed = np.where((mask == OBJECT)[..., None], color, 0).astype(np.float64)
-    drawn = np.where((mask <= OBJECT)[..., None], drawing.image, 0).astype(np.float64)
-    error = float(((observed - drawn) ** 2).mean())
-    return 10.0 * float(np.log10(_FULL**2 / max(error, _LEAST_ERROR)))
-
-
-def photometric_curves(
-    views: Sequence[View],
-    rollout: Float[ndarray, "frame node 3"],
-    *,
-    scored: View | None = None,
-) -> dict[str, Float[ndarray, " frame"]]:
-    """Measure every frame in one view.
-
-    Args:
-        views: Views of the recording; all that have color lend it to the nodes.
-        rollout: Surface nodes, finite [m].
-        scored: The view, which may be one that is held out and lends no color; None takes the first
-            one that has masks, as PhysTwin does.
-
-    Returns:
-        ``iou``, and ``psnr`` [dB] if that view has color; nothing if no view has masks.
-    """
-    view = scored or next((view for view in views if view.has_mask), None)
-    if view is None or not view.has_mask or rollout.shape[1] < 2:
-        return {}
-    node = rollout.astype(np.float64)
-    radius = DISC * resolution(node[0])
-    color = seen_colors(views, node[0]) if view.has_color else None
-    shown = np.zeros((node.shape[1], 3), dtype=np.uint8) if color is None else color
-    iou, psnr = np.full(len(node), np.nan), np.full(len(node), np.nan)
-    for frame in range(min(len(node), view.frame_count)):
-        mask = view.mask(frame)
-        drawing = draw_nodes(view.camera, node[frame], shown, radius)
-        iou[frame] = silhouette_iou(drawing, mask)
-        if color is not None:
-            psnr[frame] = shaded_psnr(drawing, view.color(frame), mask)
-    return {"iou": iou} if color is None else {"iou": iou, "psnr": psnr}

@@ -14,7 +14,7 @@ INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.
 """Code that makes the inputs of methods."""
 PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
-    *("parallel_transport.py", "quaternions.py"),
+    *("parallel_transport.py", "quaternions.py", "adam.py"),
     *("data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     "metrics/truth_metrics.py",
@@ -22,7 +22,16 @@ PREDICTIONS = (
     *INPUTS[:1],
 )
 """Code that makes predictions: fits, rules, corrections and noise."""
-SCORES = ("metrics", "synthetic/suite/cells.py", "data", "hand", "quaternions.py", "triangles.py")
+LOOKS = (
+    *("appearance", "rendering", "data", "metrics", "perception", "simulation"),
+    *("settings.py", "srgb.py", "triangles.py", "parallel_transport.py", "adam.py"),
+    "fitting/appearance_fit.py",
+)
+"""Code that fits what an object looks like, and draws it."""
+SCORES = (
+    *("metrics", "synthetic/suite/cells.py", "hand", "quaternions.py"),
+    *LOOKS,
+)
 """Code that scores predictions."""
 PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "cma", "safetensors")
 """Libraries that predictions and figures are computed with, beside OpenCV."""

@@ -23,6 +23,7 @@ from app.jobs.eta import (
     work_of,
 )
 from physhandi.fitting.config import (
+    APPEARANCE,
     EVALUATION,
     HANDS,
     OBSERVATION,
@@ -74,6 +75,36 @@ def test_work_grows_with_frames_and_iterations_and_is_none_where_nothing_is_to_b
     assert list(work_of(QUICK, replace(TOWEL, has_object=False))) == [HANDS, EVALUATION]
     without_hands = work_of(QUICK, replace(TOWEL, hand_frames=0))
     assert (without_hands[HANDS], without_hands[REFINEMENT]) == (0.0, 0.0)
+
+
+def test_a_look_that_is_asked_for_is_counted_and_drawing_it_too() -> None:
+    asked = apply_overrides(QUICK, {"appearance.enabled": True, "appearance.iterations": 100})
+    base, work = work_of(QUICK, TOWEL), work_of(asked, replace(TOWEL, has_look=True))
+    assert list(work) == [*list(base)[:-1], APPEARANCE, EVALUATION]
+    longer = apply_overrides(asked, {"appearance.iterations": 300})
+    assert work_of(longer, replace(TOWEL, has_look=True))[APPEARANCE] == 3 * work[APPEARANCE] > 0
+    assert work[EVALUATION] > 3 * base[EVALUATION]
+    dark = work_of(asked, TOWEL)
+    assert (dark[APPEARANCE], dark[EVALUATION]) == (0.0, base[EVALUATION])
+    # No earlier fit had the stage: a typical time stands in, and the whole is a rough guess.
+    fits = [finished(stages())]
+    found = expect(fits, asked.to_dict(), MACHINE, work)
+    assert found is not None
+    assert 1.0 < found.seconds[APPEARANCE] < 1000.0
+    assert found.fit_count == 0
+    own = replace(fits[0], work=work, seconds=stages(**{APPEARANCE: 7.0}))
+    found = expect([own], asked.to_dict(), MACHINE, work)
+    assert found is not None
+    assert found.seconds[APPEARANCE] == pytest.approx(7.0)
+
+
+def test_fits_that_were_made_before_a_setting_existed_had_its_default() -> None:
+    settings = {name: v for name, v in QUICK.to_dict().items() if name != "appearance"}
+    (fit,) = [finished(stages())]
+    work = work_of(QUICK, TOWEL)
+    found = expect([fit], settings, MACHINE, work)
+    assert found is not None
+    assert found.basis == "from an earlier fit with these settings"
 
 
 def test_the_median_of_the_newest_five_fits_counts_stage_by_stage() -> None:

@@ -7,7 +7,7 @@ from run_world import make_run
 
 from app.jobs.views import explain, stage_views, stages_of
 from physhandi.data.files import write_json
-from physhandi.fitting.config import STAGES
+from physhandi.fitting.config import STAGES, planned_stages
 from physhandi.run import Run
 
 NAMES = ["hands", "observation", "search", "springs", "evaluation"]
@@ -61,6 +61,15 @@ def test_a_run_that_was_not_begun_has_all_stages_to_come(tmp_path: Path) -> None
         (name, "to-come") for name in STAGES
     ]
     assert [stage["name"] for stage in stages_of(make_run(tmp_path / "b", kind="simulation"), "")]
+
+
+def test_a_run_that_fits_a_look_has_a_stage_more(tmp_path: Path) -> None:
+    look = {"profile": {"appearance": {"enabled": True}}}
+    run = make_run(tmp_path / "run", config=look)
+    names = [stage["name"] for stage in stages_of(run, "queued")]
+    assert names == [*STAGES[:-1], "appearance", "evaluation"]
+    for odd in ({"appearance": {"enabled": "yes"}}, {"appearance": 3}, ["appearance"], None):
+        assert planned_stages(odd) == STAGES
 
 
 def test_the_time_of_a_stage_is_measured_and_an_older_attempts_report_is_forgotten(

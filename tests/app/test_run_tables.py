@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from run_world import make_run
 
-from app.pages.metrics import tabulate
+from app.pages.metrics import about_quantity, tabulate
 from app.pages.parameters import meaning_of, parameter_rows
 from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
@@ -53,7 +53,37 @@ def test_of_shares_the_highest_is_the_best_and_they_are_percent() -> None:
     assert cells(accuracy) == [("50.00", False), ("75.00", True)]
     assert cells(f1) == [("25.00", True), ("25.00", True)]
     assert cells(count) == [("3", False), ("9", False)]
-    assert (psnr["unit"], cells(psnr)) == ("", [("20.00", False), ("30.00", True)])
+    assert (psnr["unit"], cells(psnr)) == ("dB", [("20.00", False), ("30.00", True)])
+
+
+def test_scores_of_pictures_have_rows_of_their_own_and_their_look_a_table() -> None:
+    scores = {
+        "photometric": {"frame": 0, "proper": {"psnr": 27.5, "iou": 0.95, "ssim": None}},
+        "future": {
+            "rollout": {
+                "chamfer_l2": 0.01,
+                "photometric": {
+                    "phystwin": {"psnr": 31.0, "ssim": 0.9, "iou": 0.5},
+                    "held_out": {"psnr": 20.0, "ssim": 0.8, "iou": 0.75},
+                },
+            },
+            "static": {"chamfer_l2": 0.02},
+        },
+    }
+    look, future = tabulate(scores)["tables"]
+    assert (look["note"], [column["name"] for column in look["columns"]]) == ("frame 0", ["proper"])
+    assert [(row["name"], row["unit"], cells(row)) for row in look["rows"]] == [
+        ("psnr", "dB", [("27.50", False)]),
+        ("iou", "%", [("95.00", False)]),
+    ]
+    rows = {row["name"]: row for row in future["rows"]}
+    assert cells(rows["photometric_phystwin_psnr"]) == [("31.00", False), (DASH, False)]
+    assert cells(rows["photometric_held_out_iou"]) == [("75.00", False), (DASH, False)]
+    assert rows["photometric_held_out_iou"]["unit"] == "%"
+    assert rows["photometric_phystwin_iou"]["about"].startswith("As PhysTwin")
+    assert "no fit saw" in rows["photometric_held_out_iou"]["about"]
+    assert about_quantity("photometric.phystwin.psnr").startswith("As PhysTwin")
+    assert cells(rows["chamfer_l2"]) == [("10.00", True), ("20.00", False)]
 
 
 def test_hands_are_no_rivals_and_pixels_stay_pixels() -> None:

@@ -14,20 +14,23 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from physhandi.data.sequence import Sequence
+from physhandi.data.view import View
 from physhandi.fitting.config import (
+    APPEARANCE,
     EVALUATION,
     HANDS,
     OBSERVATION,
     REFINEMENT,
     SEARCH,
     SPRINGS,
-    STAGES,
     PipelineConfig,
+    planned_stages,
 )
 from physhandi.perception.lifting import depth_views
 
 HANDS_OR_CONTROL, COLOR_OR_KEYPOINT = "hands or control", "color or keypoint"
 DEPTH_WITH_MASK, NO_CONTROL = "depth and mask in one view", "hands without control"
+COLOR_WITH_MASK = "color and mask in one view"
 ITERATIONS, READABLE = "refinement.iterations", "readable files"
 SEEN_HAND, SEEN_OBJECT = "a frame that shows a hand", "object in frame 0"
 REMEDIES: Mapping[str, str] = {
@@ -39,6 +42,7 @@ REMEDIES: Mapping[str, str] = {
     "'physhandi annotate SEQUENCE --click view,frame,x,y', or "
     "add views/<view>/mask/ with 8-bit PNGs: 1 object, 2 right hand, 3 left hand",
     DEPTH_WITH_MASK: "add masks to a view that has depth, or depth to one that has masks",
+    COLOR_WITH_MASK: "add masks to a view that has color, or color to one that has masks",
     "object_node": "add object_node.npy, or depth with masks, which tell the object's shape",
     HANDS_OR_CONTROL: "name the hands in sequence.yaml ('hands: [right]'), or add control.npy",
     NO_CONTROL: "nothing need be done: point controllers stay as they were given",
@@ -60,6 +64,7 @@ ABOUT: Mapping[str, str] = {
     SEARCH: "topology and global parameters of the object",
     SPRINGS: "stiffness and damping of every spring",
     REFINEMENT: "hands whose object moves as it was seen to",
+    APPEARANCE: "what the object looks like, as splats that its nodes carry",
     EVALUATION: "a rollout of all frames, and how well it went",
 }
 """What each stage makes."""
@@ -156,8 +161,9 @@ def readiness(
         config: Settings of the fit; None are the default ones.
 
     Returns:
-        A stage's readiness by its name, in the order of the stages. If `EVALUATION` is not ready,
-        there is nothing to fit, and no stage is.
+        A stage's readiness by its name, in the order of the stages; `APPEARANCE`, for which the
+        first recording counts, is among them only if the settings ask for it. If `EVALUATION` is
+        not ready, there is nothing to fit, and no stage is.
     """
     recordings = [sequences] if isinstance(sequences, Sequence) else list(sequences)
     hands = {sequence.name: missing_for_hands(sequence) for sequence in recordings}
@@ -175,6 +181,9 @@ def readiness(
     elif of_object.is_ready and not any(is_moved_by_hands(sequence) for sequence in recordings):
         why = "point controllers (control.npy) take the place of hands"
         of_refinement = StageReadiness(missing=(NO_CONTROL,), is_needed=False, why=why)
+    of_appearance = of_object
+    if of_object.is_ready and not colored_views(recordings[0]):
+        of_appearance = _lacking({recordings[0].name: [COLOR_WITH_MASK]})
     of_all = StageReadiness()
     if not can_fit:
         of_all = _lacking({name: [*object_[name], *hands[name]] for name in hands})
@@ -184,9 +193,16 @@ def readiness(
         SEARCH: of_object,
         SPRINGS: of_object,
         REFINEMENT: of_refinement,
+        APPEARANCE: of_appearance,
         EVALUATION: of_all,
     }
-    return {stage: found[stage] for stage in STAGES}
+    planned = planned_stages(None if config is None else config.to_dict())
+    return {stage: found[stage] for stage in planned}
+
+
+def colored_views(sequence: Sequence) -> tuple[View, ...]:
+    """List the views that show what the object looks like: those with color and masks."""
+    return tuple(view for view in sequence.views if view.has_color and view.has_mask)
 
 
 def is_moved_by_hands(sequence: Sequence) -> bool:

@@ -17,9 +17,18 @@ from typing import Any, TypedDict
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from safetensors.numpy import save
 
+from physhandi.appearance.scoring import (
+    PHYSTWIN,
+    PictureCurves,
+    add_picture_scores,
+    picture_curves,
+    rebound,
+)
+from physhandi.appearance.splats import Splats
 from physhandi.data.environment import processor_name
-from physhandi.data.files import write_array, write_json
+from physhandi.data.files import read_tensors, write_array, write_bytes, write_json
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.lease import locked_file
 from physhandi.data.run import RunFolder
@@ -30,6 +39,7 @@ from physhandi.data.run_folder import (
     read_json,
     read_mapping,
     read_record,
+    reading,
 )
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SIDES
@@ -44,11 +54,10 @@ from physhandi.errors import (
     SimulationError,
     UsageError,
 )
-from physhandi.metrics.photometric import photometric_curves
 from physhandi.metrics.report import measure_run
 from physhandi.metrics.truth_metrics import true_surface
 from physhandi.progress import Progress
-from physhandi.synthetic.code_version import PREDICTIONS, SCORES, code_version
+from physhandi.synthetic.code_version import LOOKS, PREDICTIONS, SCORES, code_version
 from physhandi.synthetic.suite.methods import (
     HAND_NOISE,
     METHODS,
@@ -56,8 +65,11 @@ from physhandi.synthetic.suite.methods import (
     Method,
     correct,
     execute,
+    fit_look,
+    look_settings,
     method_settings,
     shared_stages,
+    shows_look,
     simulate_in,
 )
 from physhandi.synthetic.suite.variants import DISTURBED_HAND, make_variant, noise_seed
@@ -282,7 +294,9 @@ class Bench:
         self, run: RunFolder | None, reference: RunFolder, recording: Sequence
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Score a run against the whole recording (`measure_cell`), or reuse stored scores."""
+        look = self.look(recording)
         parts = [reference.folder.name, "" if run is None else run.folder.name]
+        parts += ["" if look is None else look.name]
         parts += [str(len(recording.reconstruction_frames)), code_version(SCORES)]
         key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
         path = self.out / "scores" / f"{key}.json"
@@ -291,11 +305,40 @@ class Bench:
         except RunError:
             stored = None  # Damaged: it is measured again.
         if stored is None:
-            report, curves = measure_cell(run, reference, recording)
+            report, curves = measure_cell(
+                run,
+                reference,
+                recording,
+                splats=None if look is None else read_look(look),
+                progress=self.progress,
+                device=self.device,
+            )
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, {"report": report, "curves": curves})
             stored = checked(read_json(path), StoredScores, path)
         return stored["report"], stored["curves"]
+
+    def look(self, recording: Sequence) -> Path | None:
+        """Fit what the object of a recording looks like, once for all methods, or find it fitted.
+
+        Returns:
+            The splats' file; None if the order leaves them out, or no view has color and masks.
+        """
+        config = look_settings(self.common)
+        reference = self.reference(recording)
+        if not config.enabled or not shows_look(reference, recording):
+            return None
+        parts = [reference.folder.name, config.to_dict(), code_version(LOOKS)]
+        key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
+        path = self.out / "looks" / f"{recording.name[:28]}-{key}.safetensors"
+        with self._alone(path.stem):
+            if not path.is_file():
+                splats = fit_look(
+                    reference, recording, config, device=self.device, progress=self.progress
+                )
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_bytes(path, save(splats.to_tensors()))
+        return path
 
     def _run(self, method: Method, recording: Sequence, variant: str) -> RunFolder:
         folder = self._folder(method, recording, variant)
@@ -449,8 +492,24 @@ def _as_one_split(recording: Sequence) -> Sequence:
     return Sequence(recording.folder, meta)
 
 
+def read_look(path: Path) -> Splats:
+    """Read what `Bench.look` fitted.
+
+    Raises:
+        RunError: If the file is damaged.
+    """
+    with reading(path):
+        return Splats.from_tensors(read_tensors(path))
+
+
 def measure_cell(
-    run: RunFolder | None, reference: RunFolder, recording: Sequence
+    run: RunFolder | None,
+    reference: RunFolder,
+    recording: Sequence,
+    *,
+    splats: Splats | None = None,
+    progress: Progress | None = None,
+    device: str = "cpu",
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Score a run's prediction.
 
@@ -461,6 +520,9 @@ def measure_cell(
         run: The run to score.
         reference: The static object on the same recording.
         recording: The whole recording, with its truth.
+        splats: What its object looks like; None compares no pictures.
+        progress: Told about every frame that is drawn.
+        device: Warp device that draws.
 
     Returns:
         The report and the errors of the rollout frame by frame.
@@ -469,7 +531,18 @@ def measure_cell(
         assemble(Path(folder), run, reference, recording)
         report, frames = measure_run(Path(folder), recording, with_baselines=False)
     curves: dict[str, Any] = frames.get("rollout", {})
-    add_photometric(report, curves, run, reference, recording)
+    if splats is not None:
+        # Missing frames show the object of frame 0; the method's own nodes carry the splats.
+        rollout = _complete(run or reference, recording)
+        measured = picture_curves(
+            recording,
+            rollout,
+            rebound(splats, rollout[0]),
+            progress,
+            stage="pictures",
+            device=device,
+        )
+        add_photometric(report, curves, measured, recording)
     return report, curves
 
 
@@ -499,31 +572,27 @@ def assemble(
 def add_photometric(
     report: dict[str, Any],
     curves: dict[str, Any],
-    run: RunFolder | None,
-    reference: RunFolder,
+    measured: PictureCurves,
     recording: Sequence,
 ) -> None:
-    """Add IoU and PSNR to the other figures of the rollout.
+    """Add what pictures of the rollout score to its other figures.
 
-    The run's own nodes are drawn in the colors that they have in frame 0. Missing frames show the
-    object of frame 0. Figures of the view that is held out, the first if there are several, end in
-    ``_held_out``.
+    By PhysTwin's definition figures are called ``psnr``, ``ssim`` and ``iou``; those of proper
+    scores end in ``_proper``, and in ``_held_out`` where they are of held-out views alone.
     """
-    rollout = _complete(run or reference, recording)[:, : recording.surface_node_count]
-    measured = photometric_curves(recording.views, rollout)
-    for view in recording.held_out_views[:1]:
-        beside = photometric_curves(recording.views, rollout, scored=view)
-        measured |= {f"{metric}_held_out": curve for metric, curve in beside.items()}
     splits = {
         "reconstruction": recording.reconstruction_frames,
         "future": recording.future_frames,
     }
-    for metric, curve in measured.items():
-        curves[metric] = [float(value) if np.isfinite(value) else None for value in curve]
-        for split, scored in splits.items():
-            values = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
-            if values and split in report:
-                report[split]["rollout"][metric] = sum(values) / len(values)
+    add_picture_scores(report, measured, splits)
+    for definition, by_score in measured.items():
+        suffix = "" if definition == PHYSTWIN else f"_{definition}"
+        for score, curve in by_score.items():
+            metric = f"{score}{suffix}"
+            curves[metric] = [float(value) if np.isfinite(value) else None for value in curve]
+            for split in splits.keys() & report.keys():
+                of_rollout = report[split]["rollout"]
+                of_rollout[metric] = of_rollout["photometric"][definition][score]
 
 
 def _complete(run: RunFolder, recording: Sequence) -> Float[ndarray, "frame node 3"]:

@@ -42,7 +42,11 @@ DENSE = 0.05
 contact points on average, over the frames in which it touches any."""
 _SPLITS = ("reconstruction", "future")
 _HANDS = {"chamfer_symmetric": "hand_chamfer", "mpjpe": "mpjpe", "surface_error": "hand_surface"}
-_SHADED = ("iou", "psnr", "iou_held_out", "psnr_held_out")
+_PICTURES = tuple(
+    f"{score}{definition}"
+    for definition in ("", "_proper", "_held_out")
+    for score in ("iou", "psnr", "ssim")
+)
 _TOPOLOGY = ("rrd_object", "rrd_virtual")
 Figures = dict[str, dict[str, float]]
 """Figures by split and metric."""
@@ -268,7 +272,7 @@ def figures_of(
     by_split: dict[str, Mapping[str, Any]] = {}
     for split in _SPLITS[:1] if protocol == "unseen" else _SPLITS:
         rollout = outcome.report.get(split, {}).get("rollout", {})
-        figures = {metric: rollout.get(metric) for metric in (*METRICS, *_SHADED)}
+        figures = {metric: rollout.get(metric) for metric in (*METRICS, *_PICTURES)}
         if outcome.error and rollout and unmoved is not None:
             figures |= no_contact_scores(recording, unmoved, _frames(recording, protocol, split))
         # All frames of an unseen interaction are in the first split.

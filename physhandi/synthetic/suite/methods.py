@@ -20,6 +20,8 @@ from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
 
 from physhandi import pipeline
+from physhandi.appearance.config import AppearanceConfig
+from physhandi.appearance.splats import Splats
 from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.layout import METRICS_FILE, SequenceFiles
@@ -45,6 +47,8 @@ _PLACE, _TURN, _POSE = 0.01, 0.1, 0.1
 _HALVINGS = 30
 _MOST = 8.0
 Given = Literal["recording", "true_hand", "all_frames", "truth"]
+LOOK = "appearance."
+"""Beginning of settings that say what the object looks like, which is the same for all methods."""
 SEARCH_SEED = "object_.search.seed"
 """Setting that decides the candidates of a search."""
 CORRECTIONS: dict[str, str] = {
@@ -210,7 +214,8 @@ def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]
     Args:
         method: The method; its own settings win.
         common: Settings that all methods of a suite share; numbers of iterations and generations
-            are bounds, so that none does more than by itself.
+            are bounds, so that none does more than by itself. What the object looks like is not a
+            method's: it is fitted once for all of them.
 
     Raises:
         UsageError: If a setting is unknown or out of bounds.
@@ -222,8 +227,42 @@ def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]
     shared = {
         path: min(value, reduce(getitem, path.split("."), own)) if path.endswith(_EFFORT) else value
         for path, value in common.items()
+        if not path.startswith(LOOK)
     }
     return pipeline.settings_of(method.profile, {**same_hands, **shared, **method.overrides})
+
+
+def look_settings(common: Mapping[str, Any]) -> AppearanceConfig:
+    """Give the settings of what objects look like, which is fitted unless the order leaves it out.
+
+    Args:
+        common: Settings that all methods of a suite share.
+    """
+    asked = {path: value for path, value in common.items() if path.startswith(LOOK)}
+    settings = pipeline.settings_of("default", {f"{LOOK}enabled": True} | asked)
+    return AppearanceConfig.from_dict(settings[LOOK.removesuffix(".")])
+
+
+def shows_look(reference: RunFolder, recording: Sequence) -> bool:
+    """Tell whether a recording shows what an object looks like, and a run has its nodes."""
+    has_nodes = reference.has(SequenceFiles(recording.name).object_node)
+    return has_nodes and bool(pipeline.colored_views(recording))
+
+
+def fit_look(
+    reference: RunFolder,
+    recording: Sequence,
+    config: AppearanceConfig,
+    *,
+    device: str,
+    progress: Progress,
+) -> Splats:
+    """Fit what an object looks like in frame 0, where a run has its nodes.
+
+    Raises:
+        PhysHandiError: If no view shows it, or the run is damaged.
+    """
+    return pipeline.fit_appearance(reference.out, recording, config, progress, device=device).splats
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from sheet_sequence import write_sheet
 from physhandi.data.sequence import Sequence
 from physhandi.fitting.checks.readiness import nothing_to_fit, readiness, shows_palm, skipped_object
 from physhandi.fitting.config import (
+    APPEARANCE,
     EVALUATION,
     HANDS,
     OBSERVATION,
@@ -145,6 +146,23 @@ def test_settings_can_leave_out_the_refinement(without: Callable[..., Sequence])
     assert readiness(without(), config)[REFINEMENT].is_ready
     refinement = readiness(without(), left_out)[REFINEMENT]
     assert (refinement.is_ready, refinement.state) == (False, "not needed")
+
+
+def test_a_look_is_asked_for_and_needs_color_with_masks(without: Callable[..., Sequence]) -> None:
+    config = load_profile("quick")
+    asked = config.replace(appearance=config.appearance.replace(enabled=True))
+    assert APPEARANCE not in readiness(without(), config)
+    found = readiness(without(), asked)
+    assert list(found) == [*STAGES[:-1], APPEARANCE, EVALUATION]
+    assert found[APPEARANCE].is_ready
+    dark = readiness(without("color.mp4"), asked)
+    assert {name for name, stage in dark.items() if not stage.is_ready} == {APPEARANCE}
+    assert str(dark[APPEARANCE]) == (
+        "will be skipped: 'filmed' lacks color and mask in one view; "
+        "add masks to a view that has color, or color to one that has masks"
+    )
+    bare = readiness(without("mask"), asked)
+    assert bare[APPEARANCE].missing == bare[OBSERVATION].missing
 
 
 def test_a_palm_is_shown_by_four_of_its_keypoints() -> None:

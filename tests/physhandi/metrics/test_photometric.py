@@ -9,7 +9,12 @@ import pytest
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.view import View
-from physhandi.metrics.photometric import phystwin_scores, proper_scores, seen_colors, ssim_map
+from physhandi.metrics.photometric import (
+    phystwin_scores,
+    proper_scores,
+    seen_colors,
+    structural_similarity,
+)
 
 CAMERA = PinholeCamera(
     K=np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]]),
@@ -69,7 +74,7 @@ def test_similarity_is_that_of_each_window_written_out() -> None:
     random = np.random.default_rng(1)
     one, other = random.uniform(0, 1, (2, 14, 17, 2))
     other = 0.6 * one + 0.4 * other
-    found = ssim_map(one, other)
+    found = structural_similarity(one, other)
     for channel in range(2):
         expected = [
             [
@@ -88,7 +93,7 @@ def test_two_even_images_have_the_similarity_and_noise_of_their_difference() -> 
     scores = proper_scores(np.full((40, 40, 3), 0.3), np.ones((40, 40)), mask, recorded)
     assert scores.psnr == pytest.approx(20.0)  # -20 log10 of 0.1.
     assert scores.iou == 1.0
-    inner = ssim_map(np.full((40, 40, 1), 0.2), np.full((40, 40, 1), 0.3))[20, 20, 0]
+    inner = structural_similarity(np.full((40, 40, 1), 0.2), np.full((40, 40, 1), 0.3))[20, 20, 0]
     assert inner == pytest.approx((2 * 0.06 + 1e-4) / (0.04 + 0.09 + 1e-4))
     same = proper_scores(recorded / 255, np.ones((40, 40)), mask, recorded)
     assert (same.psnr, same.ssim, same.iou) == (100.0, pytest.approx(1.0), 1.0)

@@ -1,30 +1,35 @@
 """Cells: what they are scored on, when they are computed anew, and what is told of them."""
 
 import ast
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
+from filmed_sheet import write_filmed_sheet
 from sheet_sequence import FITTED, NODE, write_sheet
 from suite_world import SETTINGS
 
 import physhandi
 from physhandi import pipeline
+from physhandi.appearance.splats import Splats
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.files import write_yaml
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
-from physhandi.errors import CancelledError, UsageError
+from physhandi.errors import CancelledError, RunError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.run import Run
-from physhandi.synthetic.code_version import INPUTS, PREDICTIONS, SCORES, code_version
+from physhandi.synthetic.code_version import (
+    INPUTS,
+    LOOKS,
+    PREDICTIONS,
+    SCORES,
+    code_version,
+)
 from physhandi.synthetic.suite import cells
-from physhandi.synthetic.suite.cells import Bench, add_photometric
+from physhandi.synthetic.suite.cells import Bench, add_photometric, measure_cell, read_look
 from physhandi.synthetic.suite.methods import METHODS, parse_method
 
 LIBRARY = Path(physhandi.__file__).parent
@@ -80,34 +85,20 @@ def run_with(folder: Path, recording: Sequence, rollout: np.ndarray) -> Run:
     return run
 
 
-def test_the_view_that_is_held_out_is_scored_too_and_lends_no_color(
-    seen: Sequence, tmp_path: Path
-) -> None:
-    # The same camera 10 cm, thus 20 px, to the left, which takes everything for blue.
-    aside = seen.folder / "truth/views/aside"
-    shutil.copytree(seen.folder / "views/a", aside)
-    fields = seen.views[0].camera.to_dict()
-    fields["T_world_camera"][0][3] -= 0.1
-    write_yaml(aside / "camera.yaml", fields)
-    for path in [*aside.glob("mask/*.png"), *aside.glob("color/*.png")]:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        assert image is not None
-        shifted = np.roll(image, 20, axis=1)
-        cv2.imwrite(str(path), shifted[..., ::-1] if image.ndim == 3 else shifted)
-    moved = np.arange(FRAMES)[:, None, None] * np.array([0.05, 0, 0]) + square(0.02)
-    run = run_with(tmp_path / "run", seen, moved.astype(np.float32))
-    report: dict[str, Any] = {"reconstruction": {"rollout": {}}, "future": {"rollout": {}}}
-    curves: dict[str, Any] = {}
-    add_photometric(report, curves, run, run, Sequence.load(seen.folder))
-    assert curves["iou_held_out"][:2] == pytest.approx(curves["iou"][:2], abs=0.02)
-    assert min(curves["iou_held_out"][:2]) > 0.88
-    # Nodes are as red as the other views show them.
-    assert curves["psnr_held_out"][1] < curves["psnr"][1] - 3.0
-    assert report["reconstruction"]["rollout"]["iou_held_out"] == curves["iou_held_out"][1]
+def red_square() -> Splats:
+    """The look of the square, bound to nodes that no method has."""
+    center = square(0.01)
+    return Splats(
+        center=center,
+        scale=np.full(len(center), 0.006, np.float32),
+        color=np.tile(np.array([200 / 255, 0, 0], np.float32), (len(center), 1)),
+        opacity=np.full(len(center), 0.98, np.float32),
+        rest_node=square(0.04),
+    )
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.01])
-def test_silhouette_and_color_are_those_of_the_method_whatever_its_nodes(
+def test_pictures_are_those_of_the_method_whatever_its_nodes(
     seen: Sequence, tmp_path: Path, spacing: float
 ) -> None:
     still = run_with(tmp_path / "still", seen, np.stack([square(0.02)] * FRAMES))
@@ -115,24 +106,67 @@ def test_silhouette_and_color_are_those_of_the_method_whatever_its_nodes(
     moved = moved.astype(np.float32)
     moved[3] = np.nan
     run = run_with(tmp_path / "run", seen, moved)
-
-    def measured(what: Run | None) -> tuple[dict[str, Any], dict[str, Any]]:
-        report: dict[str, Any] = {"reconstruction": {"rollout": {}}, "future": {"rollout": {}}}
-        curves: dict[str, Any] = {}
-        add_photometric(report, curves, what, still, seen)
-        return report, curves
-
-    report, curves = measured(run)
-    stood = measured(None)[1]
+    curves = measure_cell(run, still, seen, splats=red_square())[1]
+    stood = measure_cell(None, still, seen, splats=red_square())[1]
     # 30 and 20 of 40 columns are still covered after one and two steps.
-    assert stood["iou"][1:3] == pytest.approx([30 / 50, 20 / 60], abs=0.05)
-    assert min(curves["iou"][:3]) > 0.88
-    assert curves["iou"][3] == pytest.approx(stood["iou"][3], abs=0.03)
+    assert stood["iou_proper"][1:3] == pytest.approx([30 / 50, 20 / 60], abs=0.05)
+    assert min(curves["iou_proper"][:3]) > 0.9
+    assert curves["iou_proper"][3] == pytest.approx(stood["iou_proper"][3], abs=0.03)
     assert min(curves["psnr"][:3]) > stood["psnr"][1] + 3.0
     assert curves["psnr"][3] < curves["psnr"][2] - 3.0
-    assert report["reconstruction"]["rollout"]["iou"] == pytest.approx(curves["iou"][1])
-    future = report["future"]["rollout"]["iou"]
-    assert future == pytest.approx((curves["iou"][2] + curves["iou"][3]) / 2)
+    assert measure_cell(run, still, seen) == ({}, {})
+
+
+def test_figures_of_pictures_are_named_by_their_definition(seen: Sequence) -> None:
+    measured = {
+        definition: {score: base + place + np.arange(4.0) for place, score in enumerate(scores)}
+        for base, definition in ((10.0, "phystwin"), (20.0, "proper"), (30.0, "held_out"))
+        for scores in [("psnr", "ssim", "iou")]
+    }
+    measured["held_out"]["iou"][2:] = np.nan
+    report: dict[str, Any] = {"reconstruction": {"rollout": {}}, "future": {"rollout": {}}}
+    curves: dict[str, Any] = {}
+    add_photometric(report, curves, measured, seen)
+    assert curves["psnr"] == [10.0, 11.0, 12.0, 13.0]
+    assert curves["iou_held_out"] == [32.0, 33.0, None, None]
+    fitted, future = (report[split]["rollout"] for split in ("reconstruction", "future"))
+    assert (fitted["iou"], fitted["ssim_proper"], fitted["psnr_held_out"]) == (13.0, 22.0, 31.0)
+    assert (future["iou"], future["iou_held_out"]) == (14.5, None)
+    assert future["photometric"]["proper"] == {"psnr": 22.5, "ssim": 23.5, "iou": 24.5}
+
+
+def test_a_look_is_fitted_once_for_all_methods_unless_the_order_leaves_it_out(
+    tmp_path: Path,
+) -> None:
+    recording = write_filmed_sheet(tmp_path / "sheet")
+    common = {"appearance.splat_count": 200, "appearance.iterations": 4}
+    bench = Bench(tmp_path / "out", common=common, device="cpu", progress=NullProgress())
+    still, follows = (bench.outcome(METHODS[n], recording) for n in ("static", "rigid_follow"))
+    (look,) = (tmp_path / "out/looks").iterdir()
+    # The sheet is lifted, so that of one that stays less and less is where it was.
+    iou = still.curves["iou_proper"]
+    assert iou[0] > 0.8
+    assert iou[-1] < iou[0] - 0.2
+    # The rigid one begins like it, and then goes along with the controls.
+    assert follows.curves["psnr"][0] == still.curves["psnr"][0]
+    assert np.abs(np.subtract(follows.curves["iou"], iou)).max() > 0.05
+    assert np.isfinite(still.report["future"]["rollout"]["psnr_held_out"])
+    # Methods themselves do not fit it, and it is found again.
+    made = Run.open(tmp_path / "out/cells" / still.run)
+    assert not made.config["profile"]["appearance"]["enabled"]
+    assert made.config["profile"]["appearance"]["iterations"] == 600
+    written = look.stat().st_mtime_ns
+    again = Bench(tmp_path / "out", common=common, device="cpu", progress=NullProgress())
+    assert again.look(recording) == look
+    assert look.stat().st_mtime_ns == written
+    off = {"appearance.enabled": False}
+    without = Bench(tmp_path / "off", common=off, device="cpu", progress=NullProgress())
+    outcome = without.outcome(METHODS["static"], recording)
+    assert "iou" not in outcome.report["future"]["rollout"]
+    assert not (tmp_path / "off/looks").exists()
+    look.write_bytes(b"torn")
+    with pytest.raises(RunError, match=look.name):
+        read_look(look)
 
 
 # What a cell is found again by
@@ -160,11 +194,11 @@ def needed(start: tuple[str, ...], without: tuple[str, ...]) -> set[str]:
     return found
 
 
-# Words, looks (the colors of an object's surface are seen as photometric metrics see them), and the
-# metrics that a run notes of itself, which no table takes.
+# Words, looks (which no motion depends on), and the metrics that a run notes of itself, which no
+# table takes.
 NO_MATTER = (
     *("errors.py", "progress.py", "child.py", "devices.py", "synthetic/code_version.py"),
-    *("srgb.py", "metrics/report.py", "metrics/photometric.py"),
+    *("srgb.py", "metrics/report.py", "metrics/photometric.py", "appearance/", "rendering/"),
 )
 
 
@@ -172,10 +206,11 @@ NO_MATTER = (
     ("parts", "start", "without"),
     [
         (PREDICTIONS, ("synthetic/suite/methods.py",), NO_MATTER),
-        (SCORES, ("metrics/report.py", "metrics/photometric.py"), NO_MATTER[:-2]),
+        (SCORES, ("metrics/report.py", "appearance/scoring.py"), NO_MATTER[:5]),
+        (LOOKS, ("appearance/fit.py", "appearance/texture.py"), NO_MATTER[:5]),
         (PREDICTIONS, INPUTS, NO_MATTER),
     ],
-    ids=["predictions", "scores", "inputs"],
+    ids=["predictions", "scores", "looks", "inputs"],
 )
 def test_all_code_that_a_result_depends_on_is_in_its_hash(
     parts: tuple[str, ...], start: tuple[str, ...], without: tuple[str, ...]
