@@ -69,6 +69,21 @@ def defect(run: Run, attempt: Attempt) -> None:
     {}["a <b>key</b>"]
 
 
+def no_memory(run: Run, attempt: Attempt) -> None:
+    attempt.progress().report("zeroth_order", 1, 4, 2.0)
+    raise MemoryError
+
+
+def no_device_memory(run: Run, attempt: Attempt) -> None:
+    attempt.progress().report("zeroth_order", 1, 4, 2.0)
+    raise RuntimeError("Failed to allocate 123456789 bytes on device 'cuda:0'")
+
+
+def lost_device(run: Run, attempt: Attempt) -> None:
+    attempt.progress().report("zeroth_order", 1, 4, 2.0)
+    raise RuntimeError("CUDA error 719: unspecified launch failure")
+
+
 def script(run: Run, attempt: Attempt) -> None:
     """Do what the lines of the file `script` say, in the order in which they are added."""
     progress = attempt.progress()
@@ -105,7 +120,10 @@ def crash(run: Run, attempt: Attempt) -> None:
     os._exit(7)
 
 
-DEEDS = (publish, wait, stubborn, frozen, fail, crash, defect, script)
+DEEDS = (
+    *(publish, wait, stubborn, frozen, fail, crash, defect, script),
+    *(no_memory, no_device_memory, lost_device),
+)
 BEHAVIOURS = {f.__name__: f for f in DEEDS}
 
 

@@ -42,10 +42,11 @@ class Streams:
                 yield "retry: 2000\n\n"
                 while not (ended.is_set() or stopping.is_set() or await request.is_disconnected()):
                     quiet += _POLL_S
-                    for name, event, data in await asyncio.to_thread(lambda: list(news())):
+                    # In one piece: each piece that a reader who has gone does not take is a line
+                    # of the log.
+                    if texts := await asyncio.to_thread(lambda: [_text(one) for one in news()]):
                         quiet = 0.0
-                        text = json.dumps(data, ensure_ascii=False)
-                        yield f"id: {name}\nevent: {event}\ndata: {text}\n\n"
+                        yield "".join(texts)
                     if quiet >= _PING_S:
                         quiet = 0.0
                         yield ": ping\n\n"
@@ -74,3 +75,8 @@ class Streams:
                 streams.remove(ended)
             if not streams:
                 self._open.pop(owner, None)
+
+
+def _text(news: News) -> str:
+    name, event, data = news
+    return f"id: {name}\nevent: {event}\ndata: {json.dumps(data, ensure_ascii=False)}\n\n"

@@ -188,6 +188,28 @@ def race_cancels(count: int, folder: Path) -> Report:
     return {"done": ends.total(), **ends, "wrong": wrong, "corrupt": corrupt, "orphans": orphans}
 
 
+def cancel_fits(count: int, folder: Path) -> Report:
+    """Cancel fits while they load, in their first and second stage, polite ones and stubborn."""
+    wrong = orphans = 0
+    with queue_in(folder) as scheduler:
+        for number in range(count):
+            name, stage = (("wait", "second"), ("wait", ""), ("stubborn", "first"))[number % 3]
+            run = scheduler.launch(["sheet"], "quick", name)
+            until(lambda run=run: state_of(scheduler, run) != "queued")
+            if stage:
+                until(lambda run=run, stage=stage: run.progress.get("stage") == stage)
+            if name == "stubborn":  # Its child, in a session of its own, is at work, too.
+                until((run.folder / "pids").exists)
+            scheduler.cancel(run.id)
+            until(lambda run=run: state_of(scheduler, run) in ENDED)
+            orphans += len(list(processes_of(run.folder)))
+            until(lambda run=run: supervisor_of(run.folder) is None)
+            wrong += state_of(scheduler, run) != "cancelled" or run.is_published
+        last = scheduler.launch(["sheet"], "quick", "publish")
+        until(lambda: state_of(scheduler, last) == "succeeded")
+    return {"done": count, "wrong": wrong, "orphans": orphans, "lost": is_damaged(last)}
+
+
 def start_two_servers(count: int, folder: Path) -> Report:
     wrong = done = 0
     with queue_in(folder) as scheduler:
@@ -206,6 +228,7 @@ def start_two_servers(count: int, folder: Path) -> Report:
 CASES = {
     "R1": Case("The process of a fit is killed in the middle of a stage", 200, 1, kill_workers),
     "R2": Case("The supervisor of a fit is killed", 100, 0, kill_supervisors),
+    "R5": Case("A fit is cancelled, in every stage and however stubborn", 100, 0, cancel_fits),
     "R6": Case("A fit is cancelled while it publishes", 200, 2, race_cancels),
     "R12": Case("The process of a fit is stopped, so that it hangs", 20, 0, stop_workers),
     "R13": Case("The clock is set by hours, forth and back, during a fit", 10, 4, set_clocks),

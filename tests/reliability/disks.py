@@ -1,0 +1,136 @@
+"""Disks that are full or fail while a run is written, and memory that runs out."""
+
+import errno
+import io
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import job_worker
+import numpy as np
+from waiting import until
+
+from app.jobs.processes import processes_of
+from app.jobs.views import explain
+from physhandi.errors import PhysHandiError
+from physhandi.run import Run
+from reliability import Case, Report
+from reliability.jobs import is_damaged, queue_in, state_of
+
+CALLS: tuple[tuple[Any, str], ...] = (
+    *((os, name) for name in ("fsync", "replace", "write", "mkdir", "link")),
+    (io, "open"),
+)
+"""Calls of the system by which a run is written."""
+
+
+class Disk:
+    """Counts the calls that write, and lets one of them fail, or all from one on."""
+
+    def __init__(self, number: int | None = None, code: int = 0, *, stays: bool = False) -> None:
+        self.calls = 0
+        self._number, self._code, self._stays = number, code, stays
+
+    def look(self) -> None:
+        self.calls += 1
+        if self._number is None:
+            return
+        if self.calls == self._number or (self._stays and self.calls > self._number):
+            raise OSError(self._code, os.strerror(self._code))
+
+    @contextmanager
+    def used(self) -> Iterator["Disk"]:
+        """Let this process write on it."""
+        before = [(place, name, getattr(place, name)) for place, name in CALLS]
+
+        def tried(do: Callable[..., Any], *args: Any, **kinds: Any) -> Any:
+            mode = str(args[1]) if len(args) > 1 else ""
+            if do is not io_open or "w" in mode or "a" in mode:
+                self.look()
+            return do(*args, **kinds)
+
+        io_open = io.open
+        for place, name, do in before:
+            setattr(place, name, partial(tried, do))
+        try:
+            yield self
+        finally:
+            for place, name, do in before:
+                setattr(place, name, do)
+
+
+def _fill(run: Run) -> None:
+    with run.begin_attempt() as attempt:
+        attempt.save_array("numbers.npy", np.arange(1000.0))
+        job_worker.publish(run, attempt)
+
+
+def _fail(codes: tuple[int, ...], count: int, folder: Path) -> Report:
+    """Let a call fail at each place in turn, then fill the run on a disk that is well."""
+    chance = np.random.default_rng(8)
+
+    def new_run(name: str) -> Run:
+        sequences = ["/data/sheet"]
+        return Run.create(
+            folder / name, name=name, kind="reconstruction", sequences=sequences, config={}
+        )
+
+    with Disk().used() as whole:
+        _fill(new_run("whole"))
+    counts: Counter[str] = Counter(wrong=0, lost=0, corrupt=0)
+    for number in range(count):
+        run = new_run(f"run{number}")
+        code = codes[number % len(codes)]
+        at = int(chance.integers(1, whole.calls + 1))
+        with Disk(at, code, stays=number % 2 == 1).used(), suppress(OSError, PhysHandiError):
+            _fill(run)
+        told = Run.open(run.folder)
+        counts["survived"] += told.is_published
+        # Half published is neither: results that are not whole, or whole ones of a failed run.
+        counts["wrong"] += told.is_published != (told.state == "succeeded")
+        counts["corrupt"] += told.is_published and is_damaged(told)
+        if not told.is_published:
+            counts["told"] += os.strerror(code) in (told.error or "")
+            _fill(run)
+        counts["lost"] += Run.open(run.folder).state != "succeeded"
+        counts["corrupt"] += is_damaged(run) or run.json("first.json")["attempt"] not in {1, 2}
+    return {"done": count, **counts}
+
+
+def fill_disks(count: int, folder: Path) -> Report:
+    return _fail((errno.ENOSPC, errno.EDQUOT), count, folder)
+
+
+def break_disks(count: int, folder: Path) -> Report:
+    return _fail((errno.EIO, errno.EROFS), count, folder)
+
+
+def run_out_of_memory(count: int, folder: Path) -> Report:
+    """Let fits end for want of memory or of their device, one after the other in one slot."""
+    kinds = ("no_memory", "no_device_memory", "lost_device")
+    wrong = orphans = 0
+    with queue_in(folder) as scheduler:
+        for number in range(count):
+            run = scheduler.launch(["sheet"], "quick", kinds[number % len(kinds)])
+            until(lambda run=run: state_of(scheduler, run) == "failed")
+            until(lambda run=run: not list(processes_of(run.folder)))
+            reason = run.error or ""
+            failure = explain(run, reason)
+            wrong += not failure.advice or ("memory" in kinds[number % len(kinds)]) != (
+                "memory" in failure.message
+            )
+            orphans += len(list(processes_of(run.folder)))
+        last = scheduler.launch(["sheet"], "quick", "publish")
+        until(lambda: state_of(scheduler, last) == "succeeded")
+    return {"done": count, "wrong": wrong, "orphans": orphans, "lost": is_damaged(last)}
+
+
+CASES = {
+    "R8": Case("The disk is full, or the quota, while a run is written", 200, 12, fill_disks),
+    "R9": Case("A disk fails, or is read-only, while a run is written", 200, 12, break_disks),
+    "R11": Case("Memory runs out, or the device is lost", 20, 0, run_out_of_memory),
+}
