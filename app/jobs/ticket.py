@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder, locked
-from physhandi.data.run_folder import CANCEL, EXIT, RESERVE, now, read_record
+from physhandi.data.run_folder import CANCEL, EXIT, RESERVE, is_filled, now, read_record
 from physhandi.errors import RunError
 
 QUEUED = "queued.json"
@@ -153,7 +153,7 @@ def start_again_or_end(run_folder: Path, why: str) -> None:
         why: How it lost its process, as a sentence.
     """
     ticket = read_ticket(run_folder / STARTED) or Ticket(starts=MOST_STARTS)
-    if (run_folder / EXIT).is_file() or (run_folder / CANCEL).exists():
+    if any((run_folder / mark).exists() for mark in (EXIT, CANCEL)) or is_filled(run_folder):
         note_end(run_folder, why)
     elif ticket.starts < MOST_STARTS:
         put_in_line(run_folder, replace(ticket, why=why))
@@ -167,7 +167,8 @@ def note_end(run_folder: Path, error: str, kind: str = "") -> None:
 
     Args:
         run_folder: The run.
-        error: What went wrong; a run that was to be cancelled is cancelled whatever it is.
+        error: What went wrong; a run that was to be cancelled is cancelled whatever it is, and one
+            whose results are published has succeeded.
         kind: Name of the error's class, if it is known.
     """
     is_cancelled = (run_folder / CANCEL).exists()
@@ -176,13 +177,12 @@ def note_end(run_folder: Path, error: str, kind: str = "") -> None:
             return
         (run_folder / RESERVE).unlink(missing_ok=True)
         if not (run_folder / EXIT).is_file():
-            content = {"state": "cancelled" if is_cancelled else "failed", "time": now()}
-            content |= (
-                {"error": "Cancelled.", "error_type": ""}
-                if is_cancelled
-                else {"error": error, "error_type": kind}
-            )
-            write_json(run_folder / EXIT, content)
+            told: dict[str, str] = {"state": "failed", "error": error, "error_type": kind}
+            if is_filled(run_folder):
+                told = {"state": "succeeded"}
+            elif is_cancelled:
+                told = {"state": "cancelled", "error": "Cancelled.", "error_type": ""}
+            write_json(run_folder / EXIT, {**told, "time": now()})
         (run_folder / STARTED).unlink(missing_ok=True)
 
 

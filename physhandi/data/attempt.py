@@ -50,6 +50,7 @@ from physhandi.data.run_folder import (
     file_record,
     find_damage,
     inside,
+    is_filled,
     now,
     read_events,
     read_mapping,
@@ -516,7 +517,13 @@ class Attempt:
         with locked(self.run_folder):
             self._lease.check()
             write_json(self.folder / MANIFEST, manifest)
-            write_bytes(self.run_folder / CURRENT, f"{self.number}\n".encode())
+            try:
+                write_bytes(self.run_folder / CURRENT, f"{self.number}\n".encode())
+            except OSError as error:
+                if not is_filled(self.run_folder):
+                    raise
+                # It is in place, though perhaps not after a power failure.
+                logger.warning("the disk does not confirm the results: %s", describe(error))
             self._end("succeeded", None)
 
     def fail(self, error: BaseException | str) -> None:

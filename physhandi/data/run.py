@@ -52,6 +52,7 @@ from physhandi.data.run_folder import (
     checked,
     find_damage,
     inside,
+    is_filled,
     now,
     read_json,
     read_number,
@@ -214,12 +215,11 @@ class RunFolder:
         end = read_record(self.folder / EXIT, ExitFile)
         if end is not None:
             return end["state"]
-        numbers = attempt_numbers(self.folder)
-        if numbers and self._published() == numbers[-1]:
+        if is_filled(self.folder):
             return "succeeded"
         if (self.folder / CANCEL).exists():
             return "cancelled"
-        return "failed" if numbers else "queued"
+        return "failed" if attempt_numbers(self.folder) else "queued"
 
     @property
     def error(self) -> str | None:

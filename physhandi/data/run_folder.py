@@ -74,6 +74,14 @@ def attempt_numbers(run_folder: Path) -> list[int]:
     return sorted(int(path.name) for path in folder.iterdir() if _NUMBER.fullmatch(path.name))
 
 
+def is_filled(run_folder: Path) -> bool:
+    """Tell whether the latest attempt of a run has published its results, however it is told."""
+    numbers = attempt_numbers(run_folder)
+    if not numbers or read_number(run_folder / CURRENT) != numbers[-1]:
+        return False
+    return (run_folder / ATTEMPTS / str(numbers[-1]) / MANIFEST).is_file()
+
+
 def artefacts(folder: Path) -> Iterator[tuple[str, Path]]:
     """List files below a folder with their relative names, in order; temporary ones are skipped."""
     for path in sorted(folder.rglob("*")):

@@ -1,5 +1,6 @@
 """When a process is taken to hang, what a kill is put down to, and who is started again."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -120,6 +121,25 @@ def test_a_lost_run_that_was_to_end_or_had_ended_is_not_started_again(
         run.request_cancel()
     start_again_or_end(run.folder, "It hung.")
     assert run.state == ("failed" if end == EXIT else "cancelled")
+    assert not (run.folder / QUEUED).exists()
+    assert not (run.folder / STARTED).exists()
+
+
+@pytest.mark.parametrize("is_cancelled", [False, True])
+def test_a_run_whose_results_are_published_has_succeeded_however_its_process_ended(
+    tmp_path: Path, is_cancelled: bool
+) -> None:
+    run = make_run(tmp_path / "fit")
+    with run.begin_attempt() as attempt:
+        attempt.publish()
+    note_start(run.folder, "cpu")
+    (run.folder / EXIT).unlink()  # The disk was full when it was to be noted.
+    if is_cancelled:
+        run.request_cancel()
+    assert is_lost(run.folder)
+    start_again_or_end(run.folder, "It lost its process.")
+    assert json.loads((run.folder / EXIT).read_text())["state"] == "succeeded"
+    assert run.state == "succeeded"
     assert not (run.folder / QUEUED).exists()
     assert not (run.folder / STARTED).exists()
 

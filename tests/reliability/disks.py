@@ -15,6 +15,7 @@ import numpy as np
 from waiting import until
 
 from app.jobs.processes import processes_of
+from app.jobs.ticket import note_end
 from app.jobs.views import explain
 from physhandi.errors import PhysHandiError
 from physhandi.run import Run
@@ -26,6 +27,9 @@ CALLS: tuple[tuple[Any, str], ...] = (
     (io, "open"),
 )
 """Calls of the system by which a run is written."""
+
+_STRIDE = 23
+"""Calls between two that fail, so that few of them lie everywhere, and many are all of them."""
 
 
 class Disk:
@@ -71,7 +75,6 @@ def _fill(run: Run) -> None:
 
 def _fail(codes: tuple[int, ...], count: int, folder: Path) -> Report:
     """Let a call fail at each place in turn, then fill the run on a disk that is well."""
-    chance = np.random.default_rng(8)
 
     def new_run(name: str) -> Run:
         sequences = ["/data/sheet"]
@@ -85,9 +88,12 @@ def _fail(codes: tuple[int, ...], count: int, folder: Path) -> Report:
     for number in range(count):
         run = new_run(f"run{number}")
         code = codes[number % len(codes)]
-        at = int(chance.integers(1, whole.calls + 1))
-        with Disk(at, code, stays=number % 2 == 1).used(), suppress(OSError, PhysHandiError):
+        turn, place = divmod(number * _STRIDE, whole.calls)
+        disk = Disk(place + 1, code, stays=(turn + number) % 2 == 1)
+        with disk.used(), suppress(OSError, PhysHandiError):
             _fill(run)
+        # The disk is well again when the supervisor notes that its worker has ended.
+        note_end(run.folder, "The worker ended.")
         told = Run.open(run.folder)
         counts["survived"] += told.is_published
         # Half published is neither: results that are not whole, or whole ones of a failed run.
