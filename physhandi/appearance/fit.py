@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -31,6 +31,7 @@ from physhandi.data.checkpoint import Checkpointer, resumed_note
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError
 from physhandi.metrics.photometric import seen_colors
+from physhandi.one_thread import one_thread
 from physhandi.perception.lifting import OBJECT_LABEL, VOXEL, fuse, surface_points
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.object_surface import ObjectSurface
@@ -40,6 +41,8 @@ _START_SCALE = 0.7
 """Standard deviation at first, in distances to the nearest splats."""
 _INVISIBLE = 0.02
 """Splats with less opacity are moved, and left out in the end."""
+_MOST_BETWEEN = 3
+"""Most splats that are added at first for each place at which one was measured or laid."""
 _NEIGHBORS = 24
 """Measured points around a splat through which a plane is laid."""
 _SMALLEST, _LARGEST = 0.45, 4.0
@@ -68,6 +71,7 @@ class FittedSplats:
     """Loss before each update."""
 
 
+@one_thread()
 def fit_splats(
     views: Sequence[View],
     node: Float[ndarray, "node 3"],
@@ -152,6 +156,9 @@ def _first_splats(
         measured = measured[KDTree(solid).query(measured)[0] < VOXEL]
     laid, shade = _on_surface(surface, node, _SAMPLES * count)
     center, is_laid = _thinned(measured, laid, count)
+    between = _between(center, min(count - len(center), _MOST_BETWEEN * len(center)))
+    is_laid = np.concatenate([is_laid, np.zeros(len(between), bool)])
+    center = np.concatenate([center, between])
     center[~is_laid] = _smoothed(center[~is_laid], measured)
     if not len(center):
         center, is_laid = node[:count].astype(np.float64), np.zeros(min(count, len(node)), bool)
@@ -188,10 +195,8 @@ def _on_surface(
         np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
     )
     share = np.cumsum(area) / max(float(area.sum()), 1e-30)
-    # A low-discrepancy sequence: evenly spread, and the same whenever it is asked for.
-    number = np.arange(count)
-    chosen = np.minimum(np.searchsorted(share, (number + 0.5) / count), len(area) - 1)
-    a, b = (np.mod(number * ratio, 1.0) for ratio in (0.7548776662466927, 0.5698402909980532))
+    chosen = np.minimum(np.searchsorted(share, (np.arange(count) + 0.5) / count), len(area) - 1)
+    a, b = _spread(count, 2).T
     over = a + b > 1.0
     a, b = np.where(over, 1.0 - a, a), np.where(over, 1.0 - b, b)
     weight = np.stack([1.0 - a - b, a, b], axis=1)
@@ -204,7 +209,7 @@ def _on_surface(
 
 def _thinned(
     measured: Float[ndarray, "_ 3"], laid: Float[ndarray, "_ 3"], count: int
-) -> tuple[Float[ndarray, "splat 3"], ndarray]:
+) -> tuple[Float[ndarray, "splat 3"], Bool[ndarray, " splat"]]:
     """Thin points to one a voxel, with voxels as small as the number of splats allows.
 
     Returns:
@@ -217,18 +222,33 @@ def _thinned(
     low, high = 1e-3 * extent, 2.0 * extent
     for _ in range(24):
         middle = math.sqrt(low * high)
-        if len(np.unique(_voxels(point, middle), axis=0)) > count:
+        if len(np.unique(_voxels(point, middle))) > count:
             low = middle
         else:
             high = middle
-    voxel = _voxels(point, high)
-    _, owner = np.unique(voxel, axis=0, return_inverse=True)
-    owner = owner.reshape(-1)
+    _, owner = np.unique(_voxels(point, high), return_inverse=True)
     real = np.bincount(owner[: len(measured)], minlength=int(owner.max()) + 1)
     is_laid = real == 0
     counts = np.where(np.arange(len(point)) < len(measured), 1.0, is_laid[owner])
     total = np.stack([np.bincount(owner, weights=counts * axis) for axis in point.T], axis=1)
     return total / np.bincount(owner, weights=counts)[:, None], is_laid
+
+
+def _between(point: Float[ndarray, "point 3"], count: int) -> Float[ndarray, "more 3"]:
+    """Give more points between those that there are, which pixels are too coarse to show."""
+    if count < 1 or len(point) < 2:
+        return np.zeros((0, 3))
+    chosen = np.arange(count) % len(point)
+    distance = KDTree(point).query(point, k=2)[0][:, 1]
+    return point[chosen] + (_spread(count, 3) - 0.5) * 2.0 * distance[chosen, None]
+
+
+def _spread(count: int, size: int) -> Float[ndarray, "point axis"]:
+    """Fill the unit cube evenly, always alike (M. Roberts' low-discrepancy sequence, 2018)."""
+    root = 2.0
+    for _ in range(32):
+        root = (1.0 + root) ** (1.0 / (size + 1))
+    return np.mod(np.arange(1, count + 1)[:, None] / root ** np.arange(1, size + 1), 1.0)
 
 
 def _smoothed(
@@ -248,8 +268,10 @@ def _smoothed(
     return point - np.sum((point - middle) * across, axis=1, keepdims=True) * across
 
 
-def _voxels(point: Float[ndarray, "point 3"], edge: float) -> ndarray:
-    return np.floor((point - point.min(axis=0)) / edge).astype(np.int64)
+def _voxels(point: Float[ndarray, "point 3"], edge: float) -> Int[ndarray, " point"]:
+    """Number the voxel of each point."""
+    place = ((point - point.min(axis=0)) / edge).astype(np.int64)
+    return np.ravel_multi_index(place.T, place.max(axis=0) + 1)
 
 
 class _Target:

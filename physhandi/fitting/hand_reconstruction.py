@@ -28,12 +28,12 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, PALM, REMEDIES, missing_for_hands
 from physhandi.fitting.config import HandFitConfig
-from physhandi.fitting.one_thread import one_thread
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.names import HandSide
 from physhandi.hand.rotation import quaternion_matrix
+from physhandi.one_thread import one_thread
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.perception.lifting import HAND_LABEL, surface_points
 from physhandi.perception.segmentation import draw_hand

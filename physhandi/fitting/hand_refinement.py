@@ -20,11 +20,11 @@ from physhandi.errors import SimulationDivergedError
 from physhandi.fitting.config import RefinementConfig as RefinementConfig
 from physhandi.fitting.hand_reconstruction import KeypointTarget, reprojection_loss
 from physhandi.fitting.object_problem import ObjectProblem, problem_parameters
-from physhandi.fitting.one_thread import one_thread
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.hand.model import HandModel, HandPose
 from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.hand.rotation import rotation_matrix
+from physhandi.one_thread import one_thread
 from physhandi.progress import Progress
 from physhandi.simulation import differentiable
 from physhandi.simulation.model import SpringMassModel

@@ -29,9 +29,9 @@ from physhandi.fitting.object_problem import (
     problem_parameters,
     settle_substeps,
 )
-from physhandi.fitting.one_thread import one_thread
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.rest_state import hold_still
+from physhandi.one_thread import one_thread
 from physhandi.progress import Progress
 from physhandi.simulation import differentiable
 from physhandi.simulation.model import SpringMassModel

@@ -24,7 +24,6 @@ from physhandi.fitting.object_problem import (
     problem_parameters,
     settle_substeps,
 )
-from physhandi.fitting.one_thread import one_thread
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.rope.bending import (
     LOGARITHMS,
@@ -36,6 +35,7 @@ from physhandi.fitting.rope.bending import (
 from physhandi.fitting.rope.moments import balance_moments, seen_nodes
 from physhandi.fitting.search import SEARCH_STAGE, SearchResult
 from physhandi.fitting.spring_optimisation import SPRING_STAGE, FirstOrderResult
+from physhandi.one_thread import one_thread
 from physhandi.progress import Progress
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
