@@ -90,6 +90,8 @@ class ServerSettings(BaseSettings):
     """GPUs that a fit asks of the cluster; without one it runs on the CPU."""
     cluster_memory_gib: float = Field(default=0.0, ge=0, le=65_536)
     """Memory that a fit asks of the cluster [GiB]; 0 asks for none in particular."""
+    store: str = Field(default="", pattern=r"^[^\x00-\x1f]*$")
+    """Address, as fsspec understands it, of a store where results are published, too."""
     waiting_fits: int = Field(default=100, ge=1, le=10_000)
     """Fits that may wait in line."""
     waiting_fits_each: int | None = Field(default=None, ge=1, le=10_000)

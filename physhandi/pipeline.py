@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.appearance.scoring import add_picture_scores, picture_curves
-from physhandi.data.attempt import Attempt
+from physhandi.data.attempt import Attempt, ResultStore
 from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.files import json_line
@@ -827,6 +827,7 @@ def run_job(
     *,
     device: str = "cpu",
     more_devices: Many[str] = (),
+    store: ResultStore | None = None,
 ) -> None:
     """Execute what a run folder asks for, and publish the result.
 
@@ -835,6 +836,7 @@ def run_job(
         progress: Also told what the run's own event log is told.
         device: Warp device.
         more_devices: Further GPUs that share the search of a reconstruction with it.
+        store: Where the result is published, too.
 
     Raises:
         PhysHandiError: If the work failed; the run folder then says why.
@@ -869,4 +871,4 @@ def run_job(
             reconstruct(
                 sequences, config, attempt, watched, device=device, more_devices=more_devices
             )
-        attempt.publish()
+        attempt.publish(store)

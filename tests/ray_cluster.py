@@ -62,10 +62,16 @@ class RealCluster:
         )
         until(lambda: self.places() == 0, self.log)
 
-    def start_node(self) -> None:
-        """Start a further node; returns when the head counts on it."""
+    def start_node(self, core: int | None = None) -> None:
+        """Start a further node; returns when the head counts on it.
+
+        Args:
+            core: The only processor that it and its jobs may use; None for all.
+        """
         before = self.places()
-        self.nodes.append(self._start(f"--address=127.0.0.1:{self.head_port}", "--num-cpus=1"))
+        held = () if core is None else ("taskset", "--cpu-list", str(core))
+        options = f"--address=127.0.0.1:{self.head_port}", "--num-cpus=1"
+        self.nodes.append(self._start(*options, held=held))
         until(lambda: self.places() == before + 1, self.log)
 
     def lose_node(self) -> None:
@@ -101,10 +107,18 @@ class RealCluster:
     def log(self) -> str:
         return (self.folder / "start.log").read_text()[-2000:]
 
-    def _start(self, *options: str) -> "subprocess.Popen[bytes]":
+    def _start(self, *options: str, held: tuple[str, ...] = ()) -> "subprocess.Popen[bytes]":
         with (self.folder / "start.log").open("ab") as log:
             return subprocess.Popen(
-                [str(RAY), "start", "--block", "--node-ip-address=127.0.0.1", _SMALL, *options],
+                [
+                    *held,
+                    str(RAY),
+                    "start",
+                    "--block",
+                    "--node-ip-address=127.0.0.1",
+                    _SMALL,
+                    *options,
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -20,6 +20,7 @@ def build() -> SubcommandApp:
     imports.command(name="phystwin")(recordings.import_phystwin)
     imports.command(name="mano")(recordings.import_mano)
     imports.command(name="hands")(recordings.import_hands)
+    imports.command(name="run")(runs.import_run)
     evaluate = SubcommandApp()
     evaluate.command(name="run")(runs.evaluate_run)
     evaluate.command(name="hands")(runs.evaluate_hands)

@@ -26,6 +26,13 @@ Engine = Annotated[
         "auto, cpu or cuda."
     ),
 ]
+Store = Annotated[
+    str | None,
+    arg(
+        help="Address of a store, as fsspec understands it (s3://BUCKET/FOLDER, file:///FOLDER), "
+        "where results are published, too (PHYSHANDI_STORE)."
+    ),
+]
 AsJson = Annotated[bool, arg(name="json", help="Print JSON instead of lines.")]
 
 

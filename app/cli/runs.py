@@ -15,7 +15,7 @@ from app.cli.lookup import (
     open_catalog,
     read_settings,
 )
-from app.cli.output import AsJson, DataDir, Device, Devices, Engine, show
+from app.cli.output import AsJson, DataDir, Device, Devices, Engine, Store, show
 from app.jobs.engines.following import FollowedRun, follow_to_end
 from app.jobs.engines.ray_engine import reached_cluster
 from app.jobs.order import default_name, fit_settings
@@ -36,6 +36,7 @@ from physhandi.fitting.config import (
 from physhandi.fitting.stored_edits import describe_edits, read_edits, store_edits
 from physhandi.progress import watched
 from physhandi.run import Run
+from physhandi.run_store import RunStore
 from physhandi.simulation.parameters import PARAMETERS, SimulationParameters, changed_parameters
 
 OVERRIDES = (
@@ -88,6 +89,7 @@ def reconstruct(
     ] = (),
     device: Devices = "auto",
     engine: Engine = None,
+    store: Store = None,
     data_dir: DataDir = None,
 ) -> None:
     """Fit hands and object of one or several sequences of the same object.
@@ -114,7 +116,8 @@ def reconstruct(
         print(f"physhandi: warning: {told}", file=sys.stderr)
     base = load_profile(profile)
     stored = fit_settings(base, dict(parse_override(text) for text in settings))
-    server = read_settings(data_dir=data_dir, engine=engine)
+    server = read_settings(data_dir=data_dir, engine=engine, store=store)
+    kept = RunStore(server.store) if server.store else None
     if server.engine == LOCAL:
         cluster, devices = None, pick_devices(device)
     else:
@@ -125,7 +128,7 @@ def reconstruct(
     else:
         run = _run_at(out, "reconstruction", recordings, stored)
     if cluster is None:
-        show(_execute(run, *devices))
+        show(_execute(run, *devices, store=kept))
         return
     print(f"physhandi: {run.folder} is fitted on {cluster.name}", file=sys.stderr)
     with watched(True) as progress, FollowedRun(run.folder, cluster) as followed:
@@ -177,6 +180,21 @@ def simulate(
     result = _execute(target, device)
     chosen = Run.open(target.folder).yaml(PARAMETERS_FILE)
     show({"substeps_per_frame": chosen["substeps_per_frame"], **result})
+
+
+def import_run(
+    address: Positional[str], *, out: Path | None = None, data_dir: DataDir = None
+) -> None:
+    """A published run from a store, whose files are all as their hashes say.
+
+    Args:
+        address: Address of the store, with the run's id as its last part: s3://BUCKET/FOLDER/RUN.
+        out: Folder to make. None makes one of that id in `runs/` of the data folder.
+    """
+    url, _, run_id = address.rstrip("/").rpartition("/")
+    store = RunStore(url)
+    folder = out or read_settings(data_dir=data_dir).run_dir / run_id
+    show({"run": str(store.fetch(run_id, folder.absolute()).folder)})
 
 
 def evaluate_run(
@@ -370,12 +388,14 @@ def _run_at(
     return run
 
 
-def _execute(run: Run, device: str, *more_devices: str) -> dict[str, Any]:
+def _execute(
+    run: Run, device: str, *more_devices: str, store: RunStore | None = None
+) -> dict[str, Any]:
     """Fill a run; see `_result`."""
     from physhandi import pipeline
 
     with watched(True) as progress:
-        pipeline.run_job(run, progress, device=device, more_devices=more_devices)
+        pipeline.run_job(run, progress, device=device, more_devices=more_devices, store=store)
     return _result(run.folder)
 
 

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from app.cli.lookup import open_catalog, read_settings
-from app.cli.output import DataDir
+from app.cli.output import DataDir, Store
 from physhandi.devices import pick_device, pick_devices
+from physhandi.run_store import RunStore
 
 
 def serve(
@@ -18,6 +19,7 @@ def serve(
     device: str | None = None,
     root_path: str | None = None,
     engine: str | None = None,
+    store: Store = None,
     captures: tuple[Path, ...] = (),
     token_file: Path | None = None,
     read_only_token_file: Path | None = None,
@@ -56,10 +58,13 @@ def serve(
         device=device,
         root_path=root_path,
         engine=engine,
+        store=store,
         captures=captures or None,
         token_file=token_file,
         read_only_token_file=read_only_token_file,
     )
+    if settings.store:
+        RunStore(settings.store)  # Tells a wrong address now, not at the end of the first fit.
     named = settings.device if "device" in settings.model_fields_set else "all"
     settings = settings.model_copy(update={"device": ",".join(pick_devices(named))})
     write_logs(settings)

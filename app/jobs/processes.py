@@ -14,6 +14,8 @@ import psutil
 from physhandi.child import set_process_option, start_module
 from physhandi.devices import only_card
 
+STORE = "PHYSHANDI_STORE"
+"""Environment variable that tells a worker where results are published, too; see `RunStore`."""
 COOKIE = "PHYSHANDI_RUN"
 """Environment variable that marks a run's processes; children inherit it, wherever they move."""
 _LOCK = ".supervisor.lock"
@@ -204,6 +206,7 @@ def start_supervisor(
     *,
     card: str | None = None,
     threads: int | None = None,
+    store: str = "",
 ) -> "subprocess.Popen[str]":
     """Start the process that starts and watches a run's worker, in a session of its own.
 
@@ -214,6 +217,7 @@ def start_supervisor(
         cookie: Mark of this start; see `cookie_of`.
         card: The only graphics card that it sees, as ``cuda:0``; None for whatever there is.
         threads: How many threads its libraries may start; none for one each processor.
+        store: Where results are published, too; empty for nowhere.
 
     Returns:
         The started process.
@@ -221,7 +225,7 @@ def start_supervisor(
     return start_module(
         *command,
         threads=threads,
-        environment={COOKIE: cookie, **only_card(card)},
+        environment={COOKIE: cookie, STORE: store, **only_card(card)},
         outlives_parent=True,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

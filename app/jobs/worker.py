@@ -4,16 +4,19 @@ The run folder tells how far it is and how it ended; its log has the details.
 """
 
 import logging
+import os
 import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
+from app.jobs.processes import STORE
 from physhandi.child import Channel, run_child
 from physhandi.errors import CancelledError
 from physhandi.progress import Progress
 from physhandi.run import Run
+from physhandi.run_store import RunStore
 
 logger = logging.getLogger(__name__)
 _LOG_INTERVAL_S = 5.0
@@ -65,7 +68,9 @@ def fill_run(run_folder: Path, device: str, step: Callable[[], None]) -> None:
     logger.info("run %s begins on %s", run.id, device)
     from physhandi import pipeline
 
-    pipeline.run_job(run, LoggedProgress(step), device=device)
+    url = os.environ.get(STORE)
+    store = RunStore(url) if url else None
+    pipeline.run_job(run, LoggedProgress(step), device=device, store=store)
     logger.info("run %s is finished", run.id)
 
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -360,6 +360,21 @@ _ATTEMPT_FILES = {LOSSES_FILE, ENVIRONMENT}
 """Written anew by every attempt, so that no stage can stand for them."""
 
 
+@runtime_checkable
+class ResultStore(Protocol):
+    """Keeps published results outside of the run's folder; see `physhandi.run_store`."""
+
+    def put_files(
+        self, run_folder: Path, number: int, files: Mapping[str, Any], beat: Callable[[], None]
+    ) -> None:
+        """Take the results of an attempt."""
+        ...
+
+    def publish(self, run_folder: Path, number: int, manifest: Mapping[str, Any]) -> None:
+        """Let them be seen."""
+        ...
+
+
 class Attempt:
     """One try at filling a run; only its process may write, and only until it is replaced.
 
@@ -499,23 +514,32 @@ class Attempt:
         """
         self._lease.heartbeat()
 
-    def publish(self) -> None:
+    def publish(self, store: ResultStore | None = None) -> None:
         """Make the outputs the run's result.
 
+        Args:
+            store: Where they are published, too; before they are here.
+
         Raises:
-            RunError: If another process took the run over; nothing is published then.
+            RunError: If another process took the run over, or the store does not take them; nothing
+                is published then.
         """
         self._lease.check()
-        manifest = {
+        manifest: dict[str, Any] = {
             "format": RUN_FORMAT,
             "attempt": self.number,
             "time": now(),
             "stages": [stage["name"] for stage in self._stages],
             "files": self._hash_outputs(),
         }
+        if store is not None:
+            files = manifest["files"]
+            store.put_files(self.run_folder, self.number, files, self._lease.heartbeat)
         shutil.rmtree(self._checkpoints, ignore_errors=True)
         with locked(self.run_folder):
             self._lease.check()
+            if store is not None:
+                store.publish(self.run_folder, self.number, manifest)
             write_json(self.folder / MANIFEST, manifest)
             try:
                 write_bytes(self.run_folder / CURRENT, f"{self.number}\n".encode())

@@ -154,7 +154,7 @@ def test_a_fit_takes_a_profile_file_and_single_settings(
 
     def keep(run: RunFolder, _progress: object, **devices: object) -> None:
         made.append(run.config)
-        assert devices == {"device": "cpu", "more_devices": ()}
+        assert devices == {"device": "cpu", "more_devices": (), "store": None}
 
     monkeypatch.setattr(pipeline, "run_job", keep)
     Path("mine.yaml").write_text("base: quick\nnode_spacing: 0.03\n")
@@ -184,9 +184,19 @@ def test_an_interrupted_fit_goes_on(terminal: Terminal, quick: PipelineConfig) -
     assert terminal.error.splitlines()[-1] == "physhandi: interrupted"
     assert Run.open("mine").state == "cancelled"
     assert pipeline.optimise_springs is original
-    assert terminal(*order) == 0
+    assert terminal(*order, "--store", f"file://{Path.cwd()}/store") == 0
     assert "first_order" in terminal.error
     assert "zeroth_order" not in terminal.error
+    # What was published in the store, too, comes back as a run of the data folder.
+    assert terminal("import", "run", f"file://{Path.cwd()}/store/mine") == 0
+    again = Run.open(terminal.data_dir / "runs" / "mine")
+    again.verify()
+    assert again.metrics == Run.open("mine").metrics
+    line = terminal.refused(1, "import", "run", f"file://{Path.cwd()}/store/other")
+    assert "there is none that is published" in line
+    line = terminal.refused(2, *order[:3], "next", "--store", "nonsense://x")
+    assert "The store nonsense://x cannot be used" in line
+    assert not Path("next").exists()
 
 
 def test_an_error_stands_on_a_line_of_its_own_below_the_progress(

@@ -6,14 +6,21 @@ from pathlib import Path
 
 import pytest
 from ray_cluster import NEEDED, RAY, RealCluster, real_cluster
+from suite_world import order_of, table, write_told
 from waiting import until
 
+from app.cli.lookup import read_settings
+from app.cli.suite_jobs import WORKER, SuiteJobs
 from app.jobs.catalog import Catalog
 from app.jobs.engines.cluster import Cluster, ClusterError, Demand
+from app.jobs.engines.following import FollowedRun, follow_to_end
+from app.jobs.engines.ray_engine import reached_cluster
 from app.jobs.processes import end_processes, processes_of
 from app.jobs.scheduler import JobView, Scheduler
 from app.settings import ServerSettings
+from physhandi.progress import Progress
 from physhandi.run import Run
+from physhandi.synthetic.suite.evaluation import evaluate_suite
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not RAY.exists(), reason=NEEDED)]
 
@@ -23,6 +30,15 @@ def cluster() -> Iterator[RealCluster]:
     with real_cluster() as cluster:
         cluster.start_node()
         yield cluster
+
+
+@pytest.fixture
+def told(cluster: RealCluster, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Tell commands of the cluster; gives its address."""
+    monkeypatch.setenv("PHYSHANDI_ENGINE_TOKEN", cluster.token)
+    monkeypatch.setenv("PHYSHANDI_CLUSTER_PYTHON", sys.executable)
+    monkeypatch.setenv("PHYSHANDI_CANCEL_GRACE_S", "0.3")
+    return cluster.address
 
 
 class Desk:
@@ -90,7 +106,8 @@ def test_a_cancel_ends_what_ignores_it_and_what_that_started(desk: Desk) -> None
     assert len(list(processes_of(run.folder))) == 3
     desk.scheduler.cancel(run.id)
     desk.until(run, "cancelled")
-    assert list(processes_of(run.folder)) == []
+    # Ray tells of the end when it has sent the last signal, which is a moment on its way.
+    until(lambda: list(processes_of(run.folder)) == [])
 
 
 def test_a_killed_supervisor_is_told_and_the_fit_started_again(desk: Desk) -> None:
@@ -109,3 +126,50 @@ def test_who_has_another_token_is_refused(cluster: RealCluster) -> None:
     with pytest.raises(ClusterError, match="refuses the token"):
         Cluster(cluster.address, cluster.token[::-1]).places(Demand())
     assert Cluster(cluster.address, cluster.token).job("nothing") is None
+
+
+def test_a_command_follows_a_fit_and_ctrl_c_returns_when_nothing_is_left(
+    told: str, data_dir: Path
+) -> None:
+    sheet = str(data_dir / "sequences" / "sheet")
+    for name, end in (("publish", "succeeded"), ("stubborn", "cancelled")):
+        run = Run.create(
+            data_dir / "runs" / name,
+            name=name,
+            kind="reconstruction",
+            sequences=[sheet],
+            config={},
+        )
+        engine = reached_cluster(read_settings(engine=told), "job_worker")
+
+        class Interrupting(Progress):
+            def check_cancelled(self, folder: Path = run.folder) -> None:
+                if (folder / "pids").exists():
+                    assert len(list(processes_of(folder))) == 3
+                    raise KeyboardInterrupt
+
+        with FollowedRun(run.folder, engine) as followed:
+            try:
+                follow_to_end(followed, engine, Interrupting(), 0.3)
+            except KeyboardInterrupt:
+                assert name == "stubborn"
+        assert run.state == end
+        until(lambda folder=run.folder: list(processes_of(folder)) == [])
+
+
+def test_cells_of_a_suite_are_jobs(told: str, tmp_path: Path) -> None:
+    recording = write_told(tmp_path / "low", 0.12)
+    out = tmp_path / "suite"
+    engine = reached_cluster(read_settings(engine=told), WORKER)
+    jobs = SuiteJobs(engine, out, Progress(), most=2, grace_s=0.3)
+    order = order_of(
+        (recording,),
+        methods=("static", "rigid_follow"),
+        protocols=("main",),
+        environment=jobs.environment(),
+    )
+    found = evaluate_suite(order, out, fill=jobs.fill(order, out))
+    assert (found["cells"], found["failed"], found["skipped"]) == (2, 0, [])
+    rows = table(out)
+    assert float(rows["static", "future", "track_error"]["mean"]) > 0.03
+    assert [path.name for path in (out / "jobs").iterdir()] == ["environment.json"]

@@ -19,10 +19,13 @@ from app.jobs.engines import local_engine, ray_engine
 from app.jobs.engines.cluster import Cluster, ClusterError, Demand
 from app.jobs.scheduler import JobView, Scheduler
 from app.jobs.ticket import QUEUED, STARTED, begin_start, read_ticket
+from app.jobs.worker import fill_run
 from app.settings import ServerSettings
+from physhandi import pipeline
 from physhandi.data.attempt import Attempt
 from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
+from physhandi.run_store import RunStore
 
 FULL = "Waits for a free place on the cluster."
 
@@ -116,6 +119,25 @@ def test_a_fit_is_one_job_with_the_same_supervisor(
     desk.step()
     assert desk.told(run_id) == ("succeeded", "")
     assert len(cluster.submitted) == 1
+
+
+def test_a_fit_is_told_of_the_store(
+    desks: Callable[..., ClusterDesk], cluster: MadeCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = desks(store="file:///a store")
+    run = Run.open(desk.folder(desk.launch()))
+    desk.step()
+    words = shlex.split(cluster.submitted[0]["entrypoint"])
+    assert "PHYSHANDI_STORE=file:///a store" in words
+    told: list[RunStore | None] = []
+    monkeypatch.setattr(pipeline, "run_job", lambda *_, store, **__: told.append(store))
+    for url in ("file:///a store", ""):
+        monkeypatch.setenv("PHYSHANDI_STORE", url)
+        fill_run(run.folder, "cpu", lambda: None)
+    assert [store.url if store else None for store in told] == ["file:///a store", None]
+    with patch.object(local_engine, "start_supervisor") as start:
+        desk.scheduler.start_now(run)
+    assert start.call_args.kwargs["store"] == "file:///a store"
 
 
 def test_as_many_fits_run_as_the_nodes_have_places(

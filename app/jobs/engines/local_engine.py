@@ -84,6 +84,7 @@ class LocalEngine:
             cookie_of(run_folder, nonce_of(run_folder, ticket)),
             card=card,
             threads=None if self.slots == 1 else max(1, (os.cpu_count() or 1) // self.slots),
+            store=self._settings.store,
         )
 
     def is_at_work(self, run_folder: Path) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from app.jobs.engines.cluster import Cluster, ClusterError, Demand
-from app.jobs.processes import COOKIE, cookie_of, supervisor_command
+from app.jobs.processes import COOKIE, STORE, cookie_of, supervisor_command
 from app.jobs.ticket import STARTED, Ticket, nonce_of, read_ticket
 from app.settings import LOCAL, ServerSettings
 from physhandi.child import thread_limits
@@ -127,6 +127,7 @@ class RayEngine:
         cookie = cookie_of(run_folder, nonce_of(run_folder, ticket))
         # Given to this command alone: the cluster's own processes are none of the run.
         marks = {COOKIE: cookie, **thread_limits(self._demand.cpus)}
+        marks |= {STORE: self._settings.store} if self._settings.store else {}
         supervisor = supervisor_command(
             run_folder, ticket.device, self._worker, self._settings.hung_after_s
         )
