@@ -66,9 +66,17 @@ def test_a_fit_is_watched_as_it_goes(world: QueueWorld, page: Page) -> None:
     expect(page.locator("#running [data-run]")).to_contain_text("script")
     expect(page.locator("#waiting [data-run]")).to_contain_text("No. 1")
     expect(page.locator("[data-slots]")).to_have_text("1 of 1 place for fits taken, 1 in line")
-    page.get_by_role("button", name="Cancel wait").click()
+    urgent = world.launch("wait too")
+    rows = page.locator("#waiting [data-run]")
+    expect(rows.nth(1)).to_contain_text("No. 2")
+    page.get_by_role("button", name="High priority for wait too").click()
+    expect(rows.first).to_contain_text(re.compile("No. 1.*wait too.*high"))
+    for name in ("wait too", "wait"):
+        page.get_by_role("button", name=f"Cancel {name}", exact=True).click()
+        expect(rows.filter(has_text=f"{name}sheet")).to_have_count(0)
     expect(page.locator("#line")).to_be_hidden()
-    world.until(waiting, "cancelled")
+    for run in (waiting, urgent):
+        world.until(run, "cancelled")
 
     page.locator("#running a").click()
     world.tell(run_id, ["report", "zeroth_order", 1, 4, 0.03])
