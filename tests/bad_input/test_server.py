@@ -256,7 +256,7 @@ def test_damaged_runs_hide_no_other(shared: World, client: TestClient) -> None:
     assert listed["whole"]["state"] == "succeeded"
     page = shared.browser().get("/runs")
     assert page.status_code == 200
-    assert all(f"/runs/{run_id}" in page.text for run_id in listed)
+    assert all(f'href="runs/{run_id}"' in page.text for run_id in listed)
     assert "Traceback" not in page.text
     response = client.post("/api/v1/sessions", json={"kind": "run", "id": "whole"})
     assert response.status_code == 201

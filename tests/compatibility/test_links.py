@@ -107,4 +107,4 @@ def test_a_filtered_list_gives_the_same_runs(old: OldFolder, world: World) -> No
         assert [run["id"] for run in answer.json()["runs"]] == listed["runs"], listed["address"]
         page = world.browser().get(listed["address"])
         assert page.status_code == 200
-        assert all(f"/runs/{run_id}" in page.text for run_id in listed["runs"])
+        assert all(f'href="runs/{run_id}"' in page.text for run_id in listed["runs"])

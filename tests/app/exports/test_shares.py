@@ -48,7 +48,7 @@ def test_a_shared_page_is_seen_without_token_until_it_is_withdrawn(
     gone = again.client(Accept="text/html").get(share["url"])
     assert gone.status_code == 404
     assert "Nothing is shared here" in gone.text
-    assert "/assets/" not in gone.text  # Which a stranger could not load.
+    assert "assets/" not in gone.text  # Which a stranger could not load.
     assert owner.delete(f"/api/v1/shares/{share['id']}").status_code == 404
     assert stranger.get(other["url"]).status_code == 200
     assert [item["id"] for item in owner.get("/api/v1/shares").json()] == [other["id"]]
