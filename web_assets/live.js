@@ -49,13 +49,13 @@
     const link = await wholeLink();
     const address = new URL(link.url, document.baseURI).href;
     const inside = document.activeElement === scene ? scene.contentWindow : window;
-    if (await copyText(address, inside)) toast("Link copied: it opens this run as you see it now.");
+    if (await copyText(address, inside)) toast(`Link copied: it opens this run as you see it now${link.lacks_path ? ", without the camera's path, which has too many key frames for a link: save that as JSON (Export)" : ""}.`, link.lacks_path);
   }
 
   /* What the link restores is filmed: parameters, layers and camera as they are now, or the camera's path. */
   async function film(entry) {
     const link = await wholeLink();
-        const query = new URLSearchParams(entry.dataset.sessionFilm);
+    const query = new URLSearchParams(entry.dataset.sessionFilm);
     if (link.camera_path && !query.has("turn") && !query.has("beside")) query.set("camera_path", link.camera_path);
     await fetchSlowFile(`api/v1/runs/${scene.dataset.target}/export?${link.query}${link.query && "&"}${query}`, "Filming");
   }

@@ -9,11 +9,12 @@ from fastapi.responses import RedirectResponse
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
-from app.exports.permalink import state_from_query, state_to_query
+from app.exports.permalink import holds_path, state_from_query, state_to_query
 from app.exports.schema import errors
 from app.ids import ItemId
 from app.root_path import address_on
 from app.security import bare_page
+from app.viewer.content.session_state import SessionState
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.errors import UsageError
@@ -35,6 +36,8 @@ class Link(BaseModel):
     """What is not in it, and what to do; empty if the address says all."""
     camera_path: str = ""
     """What the camera of a film of the scene follows, as JSON; empty if it stands still."""
+    lacks_path: bool = False
+    """Whether that has more key frames than a link holds, so that it is not in it."""
 
 
 def create_links(sessions: Sessions) -> APIRouter:
@@ -76,17 +79,28 @@ def create_links(sessions: Sessions) -> APIRouter:
             raise HTTPException(404, CLOSED)
         if not isinstance(session, Session):
             return Link(url=address_on(request, session.link), query=session.link.partition("?")[2])
-        link, lost = link_of(session), ""
-        if session.state.edits is not None:
-            lost = (
-                "Springs or nodes were edited here, which no link holds. Save it as a run (Export) "
-                "and share that."
-            )
+        link = link_of(session)
         path = "" if session.camera_path is None else session.camera_path.to_text()
         url, query = address_on(request, link), link.partition("?")[2]
-        return Link(url=url, query=query, lost=lost, camera_path=path)
+        return Link(
+            url=url,
+            query=query,
+            lost=_lost(session.state),
+            camera_path=path,
+            lacks_path=not holds_path(session.state),
+        )
 
     return router
+
+
+def _lost(state: SessionState) -> str:
+    """Say what no link holds, and what to do."""
+    if state.edits is not None:
+        return (
+            "Springs or nodes were edited here, which no link holds. Save it as a run (Export) "
+            "and share that."
+        )
+    return ""
 
 
 def link_of(session: Session) -> str:

@@ -18,6 +18,8 @@
 ``play``            1 if the clock runs
 ``speed``, ``loop`` how it runs
 ``part``            first and last frame of what is played
+``path``            key frames of the camera of a film, with ``;`` between them: frame and three
+                    times three numbers [m] (place, what it looks at, upwards), field of view
 a parameter         its name and value, if it is not as fitted; ``substeps_per_frame=auto``
 ==================  ===============================================================================
 """
@@ -27,9 +29,12 @@ from collections.abc import Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
+from app.viewer.content.camera_path import CameraPath
 from app.viewer.content.layers import THEMES, Layers
-from app.viewer.content.session_state import Pose, SessionState
+from app.viewer.content.session_state import KeyFrame, Pose, SessionState
 from physhandi.data.sequence_meta import HEAVIEST, LIGHTEST
 from physhandi.errors import UsageError
 from physhandi.simulation.parameters import AUTOMATIC, PARAMETERS, SimulationParameters
@@ -41,9 +46,11 @@ _LONGEST = 200
 _MOST_SUBSTEPS = 20_000
 _SCALES, _SPEEDS, _FOVS = (0.1, 5.0), (0.1, 2.0), (1.0, 170.0)
 _UP = (0.0, 0.0, 1.0)
+_LONGEST_PATH = 2_800
+"""Key frames are told by a link as long as servers and mails take the address: about 40."""
 _KEYS = (
     *("f", "sequence", "cam", "up", "fov", "show", "range", "scale", "from"),
-    *("theme", "fig", "play", "speed", "loop", "part", "mass"),
+    *("theme", "fig", "play", "speed", "loop", "part", "mass", "path"),
 )
 _NUMBERS = {"scale": ("force_scale", _SCALES), "mass": ("mass", (LIGHTEST, HEAVIEST))}
 _LAYER_TYPES: dict[str, Any] = get_type_hints(Layers)
@@ -76,6 +83,7 @@ def state_to_query(state: SessionState) -> dict[str, str]:
         "speed": (state.speed != 1.0, _number(state.speed)),
         "loop": (not state.does_loop, "0"),
         "part": (state.part is not None, ",".join(map(str, state.part or ()))),
+        "path": (bool(state.camera_keys) and holds_path(state), _path_text(state)),
     }
     query |= {name: text for name, (is_given, text) in rest.items() if is_given}
     for name, value in state.parameter_changes.items():
@@ -104,7 +112,7 @@ def state_from_query(query: Mapping[str, str]) -> SessionState:
             raise UsageError(
                 f"{name[:40]!r}: a link has no such field. It has: {', '.join(sorted(known))}."
             )
-        if len(text) > _LONGEST + 200 * (name == "show"):
+        if len(text) > {"show": 2 * _LONGEST, "path": _LONGEST_PATH}.get(name, _LONGEST):
             raise UsageError(f"{name}: the value is too long.")
     changes = {name: text for name, text in query.items() if name in _PARAMETERS}
     is_automatic = changes.get("substeps_per_frame") == AUTOMATIC
@@ -129,7 +137,13 @@ def state_from_query(query: Mapping[str, str]) -> SessionState:
         automatic_substeps=is_automatic,
         is_figure=_switch(query, "fig", usual=False),
         pose=_pose_from_query(query),
+        camera_keys=_path_from_query(query),
     )
+
+
+def holds_path(state: SessionState) -> bool:
+    """Tell whether a link has room for all key frames of a state's camera path."""
+    return len(_path_text(state)) <= _LONGEST_PATH
 
 
 def _named_layers(state: SessionState) -> dict[str, Any]:
@@ -208,12 +222,48 @@ def _pose_from_query(query: Mapping[str, str]) -> Pose | None:
             raise UsageError("cam: it is missing, and 'fov' and 'up' mean nothing without it.")
         return None
     place = np.array(_reals(query, "cam", 6))
-    ahead = place[3:] - place[:3]
+    return _pose(place[:3], place[3:], up, fov)
+
+
+def _pose(position: ndarray, look_at: ndarray, up: ndarray, fov: float) -> Pose:
+    """Make a camera, unless it looks nowhere, or along its up."""
+    ahead = look_at - position
     if np.linalg.norm(ahead) < 1e-9:
         raise UsageError("cam: the camera stands where it looks at (the first and last three).")
     if np.linalg.norm(np.cross(ahead, up)) < 1e-6 * np.linalg.norm(ahead):
         raise UsageError("up: the camera looks along it, so that nothing is upwards.")
-    return Pose(position=place[:3], look_at=place[3:], up=up / np.linalg.norm(up), fov=fov)
+    return Pose(position=position, look_at=look_at, up=up / np.linalg.norm(up), fov=fov)
+
+
+def _path_text(state: SessionState) -> str:
+    return ";".join(
+        f"{key.frame},{_numbers((*_rounded(key.pose), math.degrees(key.pose.fov)))}"
+        for key in state.camera_keys
+    )
+
+
+def _rounded(pose: Pose) -> Float[ndarray, " 9"]:
+    """Give where a camera stands, what it looks at and its up to a micrometre."""
+    return np.round((*pose.position, *pose.look_at, *pose.up), 6) + 0.0
+
+
+def _path_from_query(query: Mapping[str, str]) -> tuple[KeyFrame, ...]:
+    if not query.get("path"):
+        return ()
+    try:
+        keys = tuple(map(_key_frame, query["path"].split(";")))
+        return CameraPath(keys).keys
+    except UsageError as error:
+        raise UsageError(f"path: {error}") from None
+
+
+def _key_frame(text: str) -> KeyFrame:
+    name = f"key frame {text[:20]!r}"
+    frame, _, rest = text.partition(",")
+    numbers = np.array(_reals({name: rest}, name, 10))
+    fov = math.radians(_finite(name, str(numbers[9]), _FOVS))
+    pose = _pose(numbers[:3], numbers[3:6], numbers[6:9], fov)
+    return KeyFrame(frame=_integer({name: frame}, name, _LAST_FRAME), pose=pose)
 
 
 def _reals(query: Mapping[str, str], name: str, count: int) -> tuple[float, ...] | None:

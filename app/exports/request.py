@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Literal
 
 from app.exports.permalink import state_from_query
-from app.viewer.content.camera_path import CameraMotion, Turntable, parse_camera_path
+from app.viewer.content.camera_path import CameraMotion, CameraPath, Turntable, parse_camera_path
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
@@ -88,13 +88,16 @@ class FileRequest:
 
     @property
     def motion(self) -> CameraMotion | None:
-        """How the camera of a film moves; None for one that stands still.
+        """How the camera of a film moves, at last as the link says; None for one that stands still.
 
         Raises:
             UsageError: If the camera path makes no sense, or there is a turn, too.
         """
         if not self.camera_path:
-            return Turntable(self.turn) if self.turn else None
+            if self.turn:
+                return Turntable(self.turn)
+            keys = state_from_query(self.query).camera_keys
+            return CameraPath(keys) if keys else None
         if self.turn:
             raise UsageError("turn: a film has a camera path or a turn, not both.")
         return parse_camera_path(self.camera_path)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from app.viewer.content.camera_path import CameraPath
 from app.viewer.content.content import Content
 from app.viewer.content.layers import default_layers
 from app.viewer.content.session_state import SessionState
@@ -36,6 +37,8 @@ def complete_state(state: SessionState, content: Content) -> SessionState:
             f"part: '{content.sequence_name}' has frames 0 to {content.frame_count - 1}, "
             f"not {state.part[1]}."
         )
+    if state.camera_keys:
+        CameraPath(state.camera_keys).check(content.frame_count, content.sequence_name)
     layers = state.layers or replace(default_layers(content), **state.layer_changes)
     views = [view.name for view in content.views]
     if layers.looks_from is not None and layers.looks_from not in views:

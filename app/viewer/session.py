@@ -137,6 +137,7 @@ class Session(SceneServer):
                 automatic_substeps=setting is not None and setting.is_automatic,
                 is_figure=self._comparison.is_figure,
                 pose=self._comparison.pose(),
+                camera_keys=() if self._path.path is None else self._path.path.keys,
                 parameter_changes=parameter_changes(history.start, setting.parameters)
                 if history is not None and setting is not None
                 else {},
@@ -356,6 +357,7 @@ class Session(SceneServer):
             self._object.panel.restore(
                 state.parameters, is_automatic=state.automatic_substeps, edits=state.edits
             )
+        self._path.take(state.camera_keys)
         if state.pose is not None:
             state.pose.give_first(self._server.initial_camera)
         if state.is_figure:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.exports.permalink import state_from_query, state_to_query
+from app.exports.permalink import holds_path, state_from_query, state_to_query
 from app.viewer.content.layers import Layers
 from app.viewer.content.session_state import Pose, SessionState
 from physhandi.errors import UsageError
@@ -85,6 +85,25 @@ def test_what_was_written_is_read_again() -> None:
     assert state_to_query(after) == state_to_query(before)
 
 
+KEYS = "3,1,-2,0.5,0.1,0.2,0.3,0,0,1,40;17,0,-1,0.25,0,0,0.125,0,0.6,0.8,55.5"
+
+
+def test_the_path_of_a_camera_is_in_the_link() -> None:
+    after = state_from_query({"path": KEYS})
+    assert [key.frame for key in after.camera_keys] == [3, 17]
+    later = after.camera_keys[1].pose
+    np.testing.assert_allclose(later.position, [0.0, -1.0, 0.25])
+    np.testing.assert_allclose(later.look_at, [0.0, 0.0, 0.125])
+    np.testing.assert_allclose(later.up, [0.0, 0.6, 0.8])
+    assert later.fov == pytest.approx(math.radians(55.5))
+    assert state_to_query(after)["path"] == KEYS
+    assert "path" not in state_to_query(replace(after, camera_keys=()))
+    key = after.camera_keys[0]
+    many = replace(after, camera_keys=tuple(replace(key, frame=number) for number in range(200)))
+    assert (holds_path(after), holds_path(many)) == (True, False)
+    assert "path" not in state_to_query(many)
+
+
 def test_an_empty_query_leaves_everything_to_the_content() -> None:
     empty = state_from_query({})
     assert (empty.frame, empty.sequence_name, empty.layers, empty.pose) == (0, None, None, None)
@@ -104,6 +123,12 @@ def test_an_empty_query_leaves_everything_to_the_content() -> None:
         ({"f": "9" * 300}, "f"),
         ({"f": "²"}, "f"),
         ({"cam": "1,2,3"}, "cam"),
+        ({"path": "1,2,3"}, "path"),
+        ({"path": KEYS.replace("17,", "3,")}, "path: keys: there are two key frames of frame 3"),
+        ({"path": KEYS.replace("17,", "1.5,")}, "path: key frame"),
+        ({"path": KEYS.replace("55.5", "190")}, "path: key frame"),
+        ({"path": "3,1,-2,0.5,1,-2,0.5,0,0,1,40"}, "path: cam"),
+        ({"path": f"{KEYS};" * 50}, "path: the value is too long"),
         ({"cam": "1,2,3,4,5,nan"}, "cam"),
         ({"cam": "1,2,3,1,2,3"}, "cam"),
         ({"cam": "0,0,1,0,0,0"}, "up"),

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]  # none
 
-from app.viewer.content.session_state import Pose
+from app.viewer.content.session_state import KeyFrame, Pose
 from physhandi.data.files import named_fields
 from physhandi.errors import UsageError
 
@@ -22,16 +22,6 @@ _STEEPEST = 3.0
 """How much faster than on either side of a key frame the camera may pass it: more overshoots."""
 _FIELDS = {"frame", "position", "look_at", "up", "fov"}
 _SAME = 1e-9
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class KeyFrame:
-    """Where the camera is in one frame."""
-
-    frame: int
-    """The frame."""
-    pose: Pose
-    """The camera."""
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,16 @@ class Pose:
         camera.position, camera.look_at = self.position, self.look_at
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class KeyFrame:
+    """Where the camera of a film is in one frame."""
+
+    frame: int
+    """The frame."""
+    pose: Pose
+    """The camera."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SessionState:
     """Everything that a user has set in a session; a copy of it begins with this."""
@@ -131,6 +141,8 @@ class SessionState:
     parameter_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Parameters that differ from the fitted ones; they count if there are no `parameters`."""
 
+    camera_keys: tuple[KeyFrame, ...] = ()
+    """Key frames of the path that the camera of a film follows; see `CameraPath`."""
     edits: Edits | None = None
     """What is done to single springs and nodes; None for the object's own edits."""
 

@@ -8,8 +8,8 @@ import numpy as np
 import viser
 import viser.transforms
 
-from app.viewer.content.camera_path import CameraPath, KeyFrame
-from app.viewer.content.session_state import Pose
+from app.viewer.content.camera_path import CameraPath
+from app.viewer.content.session_state import KeyFrame, Pose
 from app.viewer.ui.guard import Guard, notify
 
 _NONE = "none yet"
@@ -81,6 +81,12 @@ class CameraPathPanel:
             self._keys.clear()
             self._frustum = frustum
             self._follows.value = False
+            self._show()
+
+    def take(self, keys: tuple[KeyFrame, ...]) -> None:
+        """Go on with key frames of another scene."""
+        with self._lock:
+            self._keys = {key.frame: key for key in keys}
             self._show()
 
     def follow(self, frame: int) -> None:

@@ -17,7 +17,13 @@ from app.exports.files import request_of
 from app.exports.making import make
 from app.exports.movie import FILMED_PIXELS_PER_SECOND, gif_durations
 from app.exports.request import FileRequest
-from app.viewer.content.camera_path import PATH_FORMAT, read_camera_path, turned_pose
+from app.viewer.content.camera_path import (
+    PATH_FORMAT,
+    CameraPath,
+    Turntable,
+    read_camera_path,
+    turned_pose,
+)
 from app.viewer.content.session_state import Pose
 from physhandi.errors import UsageError
 from physhandi.run import Run
@@ -101,6 +107,11 @@ def test_the_progress_of_a_film_is_told_until_it_can_be_fetched(
     film = world.script().get(world.script().post(f"{RUN}?{way}").json()["url"])
     assert film.headers["content-type"] == "image/gif"
     assert [order.camera_path for order in made] == ["", table]
+    # The path of a link is followed, too, unless something else is asked for.
+    link = replace(made[0], turn=0.0, query={"path": "2,1,-2,0.5,0.1,0.2,0.3,0,0,1,40"})
+    assert isinstance(link.motion, CameraPath)
+    assert list(link.motion.at(7).position) == [1.0, -2.0, 0.5]
+    assert replace(link, turn=90.0).motion == Turntable(90.0)
     refused = world.script().post(f"{RUN}?{way[:-3]}")
     assert (refused.status_code, "this is not JSON" in refused.text) == (422, True)
     for bad in ("format=png", f"{query}&turn=3601", f"{query}&turn=nan", "format=mp4&color=magic"):

@@ -1,6 +1,7 @@
 """The camera between key frames: closed forms, smoothness, and files that make no sense."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,11 @@ from viewer_world import rest_at
 from app.viewer.content.camera_path import (
     PATH_FORMAT,
     CameraPath,
-    KeyFrame,
     Turntable,
     parse_camera_path,
     read_camera_path,
 )
-from app.viewer.content.session_state import Pose
+from app.viewer.content.session_state import KeyFrame, Pose
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.errors import UsageError
@@ -245,6 +245,14 @@ def test_key_frames_are_set_visited_moved_and_deleted(sessions: Sessions) -> Non
         client.set("This one", "Move here")
         client.until(lambda: client.value("Key frame") == "frame 5")
         assert places_of_keys(session) == {5: list(THIRD), 8: list(SECOND)}
+        # A copy of the scene, as a link makes one, goes on with the path; another end has no room.
+        copy = sessions.get(sessions.copy(session))
+        assert isinstance(copy, Session)
+        assert places_of_keys(copy) == {5: list(THIRD), 8: list(SECOND)}
+        late = replace(session.state.camera_keys[0], frame=10_000)
+        state = replace(session.state, camera_keys=(late,))
+        with pytest.raises(UsageError, match="key frame 0: frame: 'lift' has frames 0 to"):
+            sessions.open("run", "sheet", "me", state=state)
         client.set("This one", "Delete")
         client.until(lambda: client.value("Key frame") == "frame 8")
         assert places_of_keys(session) == {8: list(SECOND)}
