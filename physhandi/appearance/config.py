@@ -22,7 +22,7 @@ class AppearanceConfig(Settings, frozen=True, kw_only=True):
     """Most splats."""
     iterations: Annotated[int, Meta(ge=0, le=100_000)] = 600
     """Updates, each by one view in turn."""
-    center_rate: _Rate = 0.05
+    center_rate: _Rate = 0.03
     """First step of their middles, in typical distances of splats; it falls to a hundredth."""
     scale_rate: _Rate = 0.01
     """Step of the logarithms of their standard deviations."""
@@ -33,19 +33,12 @@ class AppearanceConfig(Settings, frozen=True, kw_only=True):
     similarity: _Share = 0.2
     """Share of structural similarity (SSIM) in the comparison of colors, beside their mean absolute
     difference."""
-    alpha_weight: _Weight = 0.5
+    alpha_weight: _Weight = 1.0
     """Of the mean absolute difference between what splats cover and the object's mask."""
     depth_weight: _Weight = 2.0
     """Of the mean absolute difference to the measured depth [1/m]."""
     hand_margin: Annotated[int, Meta(ge=0, le=100)] = 3
     """Pixels around hands that are left out like hands, since masks end a little early [px]."""
-    outline_margin: Annotated[int, Meta(ge=0, le=100)] = 1
-    """Pixels on either side of the object's outline whose color is not compared, since masks are a
-    little wrong [px]."""
-    camera_rate: Annotated[float, Meta(ge=0.0, le=1.0)] = 1e-4
-    """First step by which cameras are moved against each other, since calibrations are a little
-    wrong, and a third of the one by which they are turned [rad]; it falls to a hundredth. 0 leaves
-    them where they are [m]."""
     renewal_interval: Annotated[int, Meta(ge=1, le=100_000)] = 100
     """Updates after which splats that cover next to nothing are moved to where the picture is
     wrong."""

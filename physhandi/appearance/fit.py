@@ -106,12 +106,10 @@ def fit_splats(
     """
     progress, checkpointer = progress or NullProgress(), checkpointer or Checkpointer()
     progress.check_cancelled()
-    recorded = cut_out_object(
-        views, frame, hand_margin=config.hand_margin, outline_margin=config.outline_margin
-    )
+    recorded = cut_out_object(views, frame, hand_margin=config.hand_margin)
     target = [_Target(one, device) for one in recorded]
     start = _first_splats(views, node, frame, surface, config.splat_count)
-    fit = _Fit(start, config, len(target), device)
+    fit = _Fit(start, config, device)
     curve: list[float] = []
     state = checkpointer.load(APPEARANCE, fit.state(curve), growing=("curve",))
     if state is not None:
@@ -121,7 +119,7 @@ def fit_splats(
         )
     for iteration in range(len(curve), config.iterations):
         progress.check_cancelled()
-        curve.append(fit.update(target, iteration))
+        curve.append(fit.update(target[iteration % len(target)], iteration))
         checkpointer.offer(APPEARANCE, iteration + 1, lambda: fit.state(curve))
         progress.report(APPEARANCE, iteration + 1, config.iterations, curve[-1])
     return FittedSplats(splats=fit.splats(node), curve=np.array(curve, np.float64))
@@ -283,11 +281,10 @@ class _Target:
 
         self.camera = recorded.camera
         self.is_known = placed(recorded.is_known)
-        self.color = placed(recorded.color) * placed(recorded.has_color)[..., None]
+        self.color = placed(recorded.color) * self.is_known[..., None]
         self.alpha = placed(recorded.is_object).float()
         self.depth = placed(recorded.depth)
         self.has_depth = (self.depth > 0) & self.is_known
-        self.has_color = placed(recorded.has_color)
         # A mean over the object: however much black is around it, errors count alike.
         self.size = float(max(int((recorded.is_object & recorded.is_known).sum()), 1))
 
@@ -295,9 +292,7 @@ class _Target:
 class _Fit:
     """Splats that are being fitted."""
 
-    def __init__(
-        self, start: _Start, config: AppearanceConfig, view_count: int, device: str
-    ) -> None:
+    def __init__(self, start: _Start, config: AppearanceConfig, device: str) -> None:
         def leaf(value: ndarray) -> Tensor:
             return torch.tensor(value, dtype=torch.float32, device=device).requires_grad_()
 
@@ -308,18 +303,11 @@ class _Fit:
         self.center, self.log_scale = leaf(start.center), leaf(np.log(start.scale))
         self.color = leaf(start.color)
         self.logit = leaf(np.full(count, math.log(_START_OPACITY / (1.0 - _START_OPACITY))))
-        # Each camera may be a little off from where its calibration says.
-        self._shift, self._turn = (leaf(np.zeros((view_count, 3))) for _ in range(2))
-        self._middle = self.center.detach().mean(dim=0)
         self._adam = {
             name: Adam(rates, betas=_BETAS)
             for name, rates in {
                 "center": [(self.center, config.center_rate * start.spacing)],
                 "color": [(self.color, config.color_rate)],
-                "camera": [
-                    (self._shift, config.camera_rate),
-                    (self._turn, 3.0 * config.camera_rate),
-                ],
                 "others": [
                     (self.log_scale, config.scale_rate),
                     (self.logit, config.opacity_rate),
@@ -328,17 +316,16 @@ class _Fit:
         }
         self._pull = torch.zeros(count, device=device)
 
-    def update(self, targets: Sequence[_Target], iteration: int) -> float:
-        """Compare with the view whose turn it is and move the splats; return the loss."""
+    def update(self, target: _Target, iteration: int) -> float:
+        """Compare with a view and move the splats; return the loss."""
         for adam in self._adam.values():
             adam.zero_grad()
-        loss = self._loss(targets, iteration % len(targets))
+        loss = self._loss(target)
         loss.backward()
         done = iteration / max(self._config.iterations - 1, 1)
         self._adam["center"].step(_LAST_CENTER_STEP**done)
         self._adam["color"].step(_LAST_COLOR_STEP**done)
         self._adam["others"].step()
-        self._adam["camera"].step(_LAST_CENTER_STEP**done)
         with torch.no_grad():
             self._pull += _gradient(self.center).norm(dim=1)
             bounds = (math.log(size * self._spacing) for size in (_SMALLEST, _LARGEST))
@@ -348,16 +335,12 @@ class _Fit:
                 self._renew()
         return float(loss.detach())
 
-    def _loss(self, targets: Sequence[_Target], view: int) -> Tensor:
-        config, target = self._config, targets[view]
-        # All cameras together stay where they are.
-        shift, turn = ((value - value.mean(dim=0))[view] for value in (self._shift, self._turn))
-        arm = self.center - self._middle
-        center = self.center + shift + torch.linalg.cross(turn.expand_as(arm), arm)
+    def _loss(self, target: _Target) -> Tensor:
+        config = self._config
         color, alpha, depth = self._draw(
-            target.camera, center, self.log_scale, self.color, self.logit
+            target.camera, self.center, self.log_scale, self.color, self.logit
         )
-        color = color * target.has_color[..., None]
+        color = color * target.is_known[..., None]
         difference = (color - target.color).abs().sum() / (3.0 * target.size)
         unlike = (1.0 - _similarity(color, target.color)).sum() / (3.0 * target.size)
         loss = (1.0 - config.similarity) * difference + config.similarity * unlike
@@ -386,8 +369,8 @@ class _Fit:
             for rows in (dead, parent):
                 self.log_scale[rows] = (_SPLIT * size).log()
                 self.logit[rows] = half.clamp(1e-4, 1.0 - 1e-4).logit()
-            for name in ("center", "color", "others"):
-                self._adam[name].forget(torch.cat([dead, parent]))
+            for adam in self._adam.values():
+                adam.forget(torch.cat([dead, parent]))
         self._pull.zero_()
 
     def state(self, curve: Sequence[float]) -> dict[str, ndarray]:
@@ -442,9 +425,14 @@ def _similarity(
     kernel = torch.exp(-0.5 * (axis / _SIGMA) ** 2)
     kernel = kernel / kernel.sum()
     maps = torch.stack([first, second, first * first, second * second, first * second])
-    maps = maps.permute(0, 3, 1, 2).reshape(15, 1, *first.shape[:2])
-    maps = torch.nn.functional.conv2d(maps, kernel.view(1, 1, 1, -1), padding=(0, _WINDOW // 2))
-    maps = torch.nn.functional.conv2d(maps, kernel.view(1, 1, -1, 1), padding=(_WINDOW // 2, 0))
+    # As channels of one image they are blurred nine times as fast as one image each.
+    maps = maps.permute(0, 3, 1, 2).reshape(1, 15, *first.shape[:2])
+    for shape, padding in (
+        ((15, 1, 1, -1), (0, _WINDOW // 2)),
+        ((15, 1, -1, 1), (_WINDOW // 2, 0)),
+    ):
+        one = kernel.expand(15, _WINDOW).reshape(shape)
+        maps = torch.nn.functional.conv2d(maps, one, padding=padding, groups=15)
     a, b, aa, bb, ab = maps.reshape(5, 3, *first.shape[:2])
     numerator = (2 * a * b + _C1) * (2 * (ab - a * b) + _C2)
     return (numerator / ((a * a + b * b + _C1) * (aa - a * a + bb - b * b + _C2))).permute(1, 2, 0)

@@ -29,29 +29,23 @@ class RecordedObject:
     """Pixels of the object."""
     is_known: Bool[ndarray, "row column"]
     """Pixels that tell whether the object is there: those that no hand is at or near."""
-    has_color: Bool[ndarray, "row column"]
-    """Those whose color belongs either to the object or to what is around it: known ones away from
-    the outline of the mask, which is a little wrong."""
     depth: Float32[ndarray, "row column"]
     """Measured depth of the object [m]; 0 where there is none."""
 
 
-def cut_out_object(
-    views: Sequence[View], frame: int, *, hand_margin: int, outline_margin: int
-) -> list[RecordedObject]:
+def cut_out_object(views: Sequence[View], frame: int, *, hand_margin: int) -> list[RecordedObject]:
     """Cut the object out of what views recorded of a frame.
 
     Args:
         views: Those with color and masks in which the object is seen count.
         frame: The frame.
         hand_margin: Pixels around hands of which nothing is known.
-        outline_margin: Pixels on either side of the object's outline whose color is not known.
 
     Raises:
         MissingInputError: If no view with color and masks shows the object.
     """
     found = [
-        _cut_out(view.straightened(), frame, hand_margin, outline_margin)
+        _cut_out(view.straightened(), frame, hand_margin)
         for view in views
         if view.has_color and view.has_mask and (view.mask(frame) == OBJECT_LABEL).any()
     ]
@@ -63,19 +57,17 @@ def cut_out_object(
     return found
 
 
-def _cut_out(view: View, frame: int, hand_margin: int, outline_margin: int) -> RecordedObject:
+def _cut_out(view: View, frame: int, hand_margin: int) -> RecordedObject:
     camera, mask, color = view.camera, view.mask(frame), view.color(frame)
     depth = view.depth(frame) if view.has_depth else np.zeros(mask.shape, np.float32)
     is_object = mask == OBJECT_LABEL
-    near_hand = _grown(mask > OBJECT_LABEL, hand_margin)
+    side = np.ones((2 * hand_margin + 1, 2 * hand_margin + 1), np.uint8)
+    near_hand = cv2.dilate((mask > OBJECT_LABEL).astype(np.uint8), side) > 0
     rows, columns = np.flatnonzero(is_object.any(axis=1)), np.flatnonzero(is_object.any(axis=0))
     top, left = max(int(rows[0]) - _MARGIN, 0), max(int(columns[0]) - _MARGIN, 0)
     part = np.s_[top : int(rows[-1]) + _MARGIN + 1, left : int(columns[-1]) + _MARGIN + 1]
     K = camera.K.copy()
     K[:2, 2] -= [left, top]
-    near_object, near_ground = (
-        _grown(is_there, outline_margin)[part] for is_there in (is_object, ~is_object)
-    )
     is_object, near_hand = is_object[part], near_hand[part]
     height, width = is_object.shape
     return RecordedObject(
@@ -83,12 +75,5 @@ def _cut_out(view: View, frame: int, hand_margin: int, outline_margin: int) -> R
         color=np.where(is_object[..., None], color[part] / np.float32(255.0), np.float32(0.0)),
         is_object=is_object,
         is_known=~near_hand,
-        has_color=~(near_hand | (near_object & near_ground)),
         depth=np.where(is_object, depth[part], np.float32(0.0)),
     )
-
-
-def _grown(is_there: Bool[ndarray, "row column"], margin: int) -> Bool[ndarray, "row column"]:
-    """Mark pixels, and those within some rows and columns of them."""
-    side = 2 * margin + 1
-    return cv2.dilate(is_there.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
