@@ -134,7 +134,7 @@ def measure_first_paint(served: Served, browser: "Browser", visits: int) -> dict
     """
     visited: list[dict[str, float]] = []
     for _ in range(visits):
-        with _new_page(browser) as page:
+        with new_page(browser) as page:
             page.goto(served.url, wait_until="load")
             page.wait_for_function(_PAINTED, polling=_POLLING_MS)
             visited.append(page.evaluate(_PAINTED))
@@ -161,7 +161,7 @@ def measure_opening(served: Served, browser: "Browser", run_id: str, visits: int
         Time from the click until the first frame with the object is drawn.
     """
     seconds: list[float] = []
-    with _new_page(browser) as page:
+    with new_page(browser) as page:
         page.add_init_script(_WATCH)
         page.goto(served.url)
         for _ in range(1 + visits):
@@ -193,7 +193,7 @@ def measure_slider_in_browser(
     arrived: list[float] = []
     drawn: list[float] = []
     before = slider.fitted
-    with _new_page(browser) as page:
+    with new_page(browser) as page:
         page.add_init_script(_WATCH)
         page.goto(served.url)
         page.goto(page.evaluate(_OPEN, run_id))
@@ -224,7 +224,8 @@ def measure_slider_in_browser(
 
 
 @contextmanager
-def _new_page(browser: "Browser") -> "Generator[Page]":
+def new_page(browser: "Browser") -> "Generator[Page]":
+    """Open a page in a new browser profile, which knows nothing of others."""
     context = browser.new_context(viewport={"width": _SIZE[0], "height": _SIZE[1]})
     context.set_default_timeout(_PATIENCE_MS)
     yield context.new_page()

@@ -63,6 +63,8 @@ GOALS: Mapping[str, Goal] = {
     "ten_sessions_frames_per_s": Goal("sessions", ("worst_frames_per_s",), 29.0, is_least=True),
     "ten_sessions_skipped_per_s": Goal("sessions", ("worst_skipped_per_s",), 1.0),
     "list_of_1000_runs_p95_ms": Goal("runs", ("worst_p95_ms",), 300.0),
+    "splats_frame_bytes": Goal("splats", ("frame_bytes",), 100_000.0),
+    "splats_server_ms": Goal("splats", ("server_ms",), 5.0),
     "live_frames_per_s": Goal("live", ("frames_per_s",), _RATE, is_least=True),
     "steered_frames_per_s": Goal("live", ("steered", "frames_per_s"), 20.0, is_least=True),
 }
@@ -176,6 +178,7 @@ class _Bench:
             "sessions": lambda: self._heavy(_SESSIONS),
             "runs": self._many_runs,
             "live": self._live,
+            "splats": self._splats,
         }
         load = os.getloadavg()[0]
         return {"load_average": load, **works[part]()}
@@ -271,6 +274,12 @@ class _Bench:
                 size = len(served.get(path)[1])
                 found[path] = {**percentiles(seconds), "server_cpu_ms": 1e3 * busy, "bytes": size}
         return {**found, "worst_p95_ms": max(found[path]["p95_ms"] for path in _LISTS)}
+
+    def _splats(self) -> dict[str, Any]:
+        from app.benchmarks.splats import measure_splats
+
+        with open_chromium() as browser:
+            return measure_splats(self._run, self._sequence, browser, self._effort.seconds / 2)
 
     def _live(self) -> dict[str, Any]:
         from app.benchmarks.latency import measure_latency

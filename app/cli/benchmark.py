@@ -205,7 +205,9 @@ def viewer(
     sessions: ten such scenes at once (worst_frames_per_s, worst_skipped_per_s, server_cpu_share);
     runs: home page and list of 1,000 runs;
     live: frames simulated in a second with automatic substeps (frames_per_s), and while a hand is
-    steered (steered).
+    steered (steered);
+    splats: pictures a second of the run's object as nodes, surface, and 1,000 to 20,000 made splats
+    (pictures_per_s), bytes of a playing frame (frame_bytes), the server's work on it (server_ms).
 
     Args:
         parts: What to measure; none measures everything.

@@ -18,8 +18,9 @@ _GRID = {
 }
 """Colors of the grid's thin and thick lines on a light and on a dark background."""
 
-_STILL = 1e-7
-"""By so little a group of splats may be elsewhere, in metres and parts of a quaternion, unseen."""
+_UNMOVED, _UNTURNED = 0.005, 5e-4
+"""By so little a group of splats may be elsewhere unseen: in widths of splats, and in parts of a
+quaternion."""
 _DARKEST = 32
 """Least brightness of a mesh's own color, by which those of its vertices are divided."""
 _LINEAR = np.round(255 * to_linear(np.arange(256) / 255)).astype(np.uint8)
@@ -294,6 +295,7 @@ class _MovedSplats:
             )
             self._nodes.append(node)
         self._pose = np.full((groups.count, 7), np.nan)
+        self._least = np.repeat([_UNTURNED, _UNMOVED * unit], [4, 3])
 
     def move(self, node: Float[ndarray, "node 3"]) -> None:
         """Move the groups that are elsewhere when the object's nodes are there.
@@ -301,8 +303,8 @@ class _MovedSplats:
         The setters of viser compare two numbers at a time, which takes seven times as long.
         """
         pose = np.concatenate(self._groups.poses(node), axis=1)
-        is_still = np.abs(pose - self._pose).max(axis=1) <= _STILL  # Of nowhere: not a number.
-        moved = np.flatnonzero(~is_still)
+        # The differences to a group that was nowhere before are not numbers.
+        moved = np.flatnonzero(~(np.abs(pose - self._pose) <= self._least).all(axis=1))
         for group in moved:
             its, at = self._nodes[group], pose[group]
             its._impl.wxyz[:], its._impl.position[:] = at[:4], at[4:]

@@ -1,6 +1,7 @@
 """The benchmark of the viewer runs against the real server, and its numbers fit each other."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from app.benchmarks.parts import PARTS
 from app.benchmarks.scenes import HEAVY, HEAVY_ARROWS, HEAVY_NODES, make_heavy_run, make_many_runs
 from app.benchmarks.served import Served, ServerFailedError
 from app.benchmarks.sliders import is_new_frame
+from app.benchmarks.splats import measure_splats, scattered
 from app.benchmarks.streams import percentiles
 from app.benchmarks.viewer import GOALS, compare_with_goals, measure_viewer
 from app.jobs.catalog import Catalog
@@ -23,6 +25,7 @@ from app.viewer.scene.object_drawing import QUIET_FORCE
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import load_fitted
 from physhandi.run import Run
+from physhandi.simulation.object_surface import lay_surface
 
 BUNDLED_RUN = "towel_fold_quick"
 
@@ -120,6 +123,39 @@ def test_a_browser_sees_the_first_paint_and_the_first_new_frame(little: None) ->
     named = {"first_paint_ms", "click_to_result_p95_ms", "slider_in_browser_p95_ms"}
     assert set(result["figures"]) == named
     assert result["figures"]["click_to_result_p95_ms"]["value"] == opened["p95_ms"]
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_splats_are_played_beside_nodes_and_the_surface(little: None) -> None:
+    run = Run.open(BUNDLED / "runs" / BUNDLED_RUN)
+    with browser.open_chromium() as chromium:
+        result = measure_splats(run, "towel_fold", chromium, 0.5, counts=(400,))
+    kinds = result["kinds"]
+    assert set(kinds) == {"nodes", "surface", "splats_400"}
+    assert result["frame_bytes"] == kinds["splats_400"]["frame_bytes"]
+    # The hand alone is 1,159 points of 12 bytes, of which packing leaves more than half.
+    assert 8_000 < kinds["splats_400"]["frame_bytes"] < kinds["surface"]["frame_bytes"]
+    for kind in kinds.values():
+        assert kind["pictures_per_s"] > 0.0
+        assert 0.0 < kind["draw_ms"] < kind["server_ms"]
+
+
+def test_made_splats_lie_on_the_surface_in_its_colors() -> None:
+    x, y = np.meshgrid(np.linspace(0.0, 0.2, 9), np.linspace(0.0, 0.1, 5))
+    node = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.3)], axis=1)
+    surface = lay_surface(node, kind="sheet")
+    assert surface is not None
+    left = surface.place(node)[:, 0] < 0.1
+    color = np.where(left[:, None], [250, 0, 0], [0, 0, 250]).astype(np.uint8)
+    splats = scattered(replace(surface, color=color), node, 2_000)
+    np.testing.assert_allclose(splats.center[:, 2], 0.3, atol=1e-6)
+    np.testing.assert_allclose(splats.center.mean(axis=0)[:2], [0.1, 0.05], atol=0.004)
+    assert splats.scale[0] == pytest.approx(0.7 * np.sqrt(0.02 / 2_000), rel=1e-3)
+    is_left = splats.center[:, 0] < 0.08
+    np.testing.assert_allclose(
+        splats.color[is_left], [[250 / 255, 0, 0]] * is_left.sum(), atol=0.01
+    )
 
 
 def test_goals_are_compared_in_the_right_direction() -> None:
