@@ -58,7 +58,7 @@ def _batch(count: int, folder: Path, cluster: RealCluster) -> tuple[list[Run], f
         scheduler.launch(
             ["sheet"], "quick", overrides={**SETTINGS, **_EFFORT, "object_.search.seed": seed}
         )
-        for seed in range(count)
+        for seed in range(1, count + 1)
     ]
     begin = time.monotonic()
     scheduler.start()
