@@ -1,5 +1,6 @@
 """Fits that a command has a cluster compute: followed, ended, found again, published once."""
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -260,3 +261,15 @@ def test_a_run_of_another_engine_is_not_taken_over(
     for _ in range(2):
         with pytest.raises(PhysHandiError, match=r"was started on ray://10\.0\.0\.9:8265"):
             FollowedRun(run.folder, engine)
+
+
+def test_a_run_that_a_process_here_fills_is_not_started_beside_it(
+    cluster: MadeCluster, engine: RayEngine, make: Callable[[str], Run]
+) -> None:
+    run = make("publish")
+    with run.begin_attempt() as attempt:
+        for _ in range(2):
+            with pytest.raises(RunError, match=f"is being written by process {os.getpid()} on"):
+                FollowedRun(run.folder, engine)
+        attempt.publish()
+    assert cluster.submitted == []

@@ -58,7 +58,8 @@ class FollowedRun:
             patience_s: How long to wait for a server that starts or ends the run now [s].
 
         Raises:
-            RunError: If another process follows the run, or it was started on another engine.
+            RunError: If another process follows the run, it was started on another engine, or a
+                process that no engine has started works on it.
         """
         self.folder = folder
         self._engine = engine
@@ -67,6 +68,13 @@ class FollowedRun:
         if not self._claim.enter_context(following(folder, patience_s)):
             raise RunError(f"Run '{folder.name}' is followed by another process. Wait for its end.")
         ticket = read_ticket(folder / STARTED)
+        holder = live_holder(folder)
+        if ticket is None and holder is not None:
+            self._claim.close()
+            raise RunError(
+                f"Run '{folder.name}' is being written by process {holder['pid']} on "
+                f"{holder['host']}. Wait for it or cancel it first."
+            )
         if ticket is None or (folder / EXIT).is_file():
             (folder / CANCEL).unlink(missing_ok=True)
             put_in_line(folder, Ticket(time=time.time()))
