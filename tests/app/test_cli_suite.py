@@ -91,6 +91,19 @@ def test_help_tells_what_is_taken_by_default(capsys: pytest.CaptureFixture[str])
     assert "(default: )" not in out
 
 
+def test_an_order_says_how_many_splats_show_an_object_and_0_compares_no_pictures(
+    data_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    order = ("--sequences", "sheet", "--methods", "static", "--device", "cpu", "--json")
+    for count, told in ((0, "appearance.enabled = False"), (40, "appearance.splat_count = 40")):
+        out = data_dir / f"with_{count}"
+        place = ("--data-dir", data_dir, "--out", out, "--splats", count)
+        assert call(capsys, *order, *place)[0] == 0
+        report = (out / "report.md").read_text()
+        assert f"--splats {count} --sequences sheet" in report
+        assert f"settings that all methods share: node_spacing = 0.01, {told}\n" in report
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
@@ -100,6 +113,7 @@ def test_help_tells_what_is_taken_by_default(capsys: pytest.CaptureFixture[str])
         (("--suite", "tiny", "--seeds", "-3"), "negative"),
         (("--suite", "tiny", "--jobs", "0"), "--jobs 0 makes no sense; choose 1 to 64"),
         (("--suite", "tiny", "--methods", "quick@nothing=1"), "nothing"),
+        (("--sequences", "sheet", "--splats", "-1"), "appearance.splat_count is -1"),
     ],
 )
 def test_an_order_that_makes_no_sense_writes_nothing(
