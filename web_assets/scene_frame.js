@@ -7,9 +7,11 @@
 
 {
   const LONGEST_MS = 10000;
+  const LEAST_ASPECT = 1;
   const SHOWN = ["MeshMessage", "PointCloudMessage", "LineSegmentsMessage", "CameraFrustumMessage", "BatchedMeshesMessage", "GaussianSplatsMessage"];
   const LINEAR = Float32Array.from({ length: 256 }, (_, value) => (value < 10.32 ? value / 3294.6 : ((value / 255 + 0.055) / 1.055) ** 2.4));
   const given = new WeakMap();
+  const isRecording = Boolean(window.__VISER_EMBED_CONFIG__) || new URLSearchParams(location.search).has("playbackPath");
 
   function meshOf(group, count) {
     let found = null;
@@ -57,12 +59,23 @@
     return isChanged;
   }
 
+  /* A recording's camera stands where a picture on a desk shows all; a narrower one shows as much from side to side. */
+  function keepSides(viewer) {
+    const { camera, cameraControl } = viewer;
+    if (!camera || !cameraControl) return;
+    const zoom = Math.min(1, camera.aspect / LEAST_ASPECT);
+    if (Math.abs(camera.zoom - zoom) < 1e-6) return;
+    cameraControl.zoomTo(zoom, false);
+    viewer.requestRender();
+  }
+
   const painted = new Set();
 
   function follow() {
     requestAnimationFrame(follow);
     const [tree, viewer] = [window.__viserSceneTree, window.__viserMutable];
     if (!tree || !viewer) return;
+    if (isRecording) keepSides(viewer);
     let [isChanged, hasContent] = [false, false];
     for (const [name, node] of Object.entries(tree.getState())) {
       const colors = node?.message.type === "MeshMessage" ? node.message.props.color : [];

@@ -36,6 +36,13 @@ def places(position: np.ndarray, camera: dict[str, Any], shape: Any) -> tuple[An
     return row, column
 
 
+_ZOOM = """(widest) => {
+  const { camera } = document.getElementById("scene").contentWindow.__viserMutable;
+  const isThere = camera.aspect < widest && camera.aspect > widest / 2;
+  return isThere && Math.abs(camera.zoom - Math.min(1, camera.aspect)) < 1e-4;
+}"""
+
+
 @pytest.fixture
 def base(served: Any) -> str:
     return served.base
@@ -109,6 +116,12 @@ def test_a_replay_plays_without_a_session_and_from_one_file(
     until_drawn(home)
     (cached,) = (served.data_dir / "cache" / "exports").glob("towel_fold_quick-*.viser")
     assert cached.stat().st_size < 60 / 300 * 20e6
+
+    # A narrow picture shows as much from side to side as one that is as wide as high.
+    home.set_viewport_size({"width": 390, "height": 844})
+    home.wait_for_function(_ZOOM, arg=0.6)
+    home.set_viewport_size({"width": 1280, "height": 800})
+    home.wait_for_function(_ZOOM, arg=2.0)
 
     home.locator("summary", has_text="Save").click()
     with home.expect_download() as download:
