@@ -20,9 +20,9 @@ class AppearanceConfig(Settings, frozen=True, kw_only=True):
     """Whether splats are fitted at all."""
     splat_count: Annotated[int, Meta(ge=1, le=1_000_000)] = 5000
     """Most splats."""
-    iterations: Annotated[int, Meta(ge=0, le=100_000)] = 600
+    iterations: Annotated[int, Meta(ge=0, le=100_000)] = 300
     """Updates, each by one view in turn."""
-    center_rate: _Rate = 0.03
+    center_rate: _Rate = 0.015
     """First step of their middles, in typical distances of splats; it falls to a hundredth."""
     scale_rate: _Rate = 0.01
     """Step of the logarithms of their standard deviations."""
