@@ -38,6 +38,9 @@ FRAME_BYTES = 92_000
 _ARROWS = 800
 _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
+_SUNK, _SUNK_FOR_SPLATS = 0.001, 0.015
+"""How far below the ground its grid is, in the scene's extent: splats of what lies there reach
+below it, and lines would be seen through them."""
 _GROUP_BYTES = 70
 """What the pose of a group of splats weighs, packed."""
 _LEAST_BYTES = 12_000
@@ -143,7 +146,7 @@ class SceneDrawing:
                 looks_from=self.layers.looks_from,
                 is_playing=is_playing,
             )
-            self._draw_ground(rollout)
+            self._draw_ground(rollout, has_splats=layers.splats)
             self._nodes.color_ground("/ground", is_dark=self.layers.dark)
 
     def hide(self) -> None:
@@ -163,7 +166,7 @@ class SceneDrawing:
             if view.name == self.layers.looks_from:
                 pose_of_view(view, self._framing).give_first(camera)
 
-    def _draw_ground(self, rollout: ObjectRollout | None) -> None:
+    def _draw_ground(self, rollout: ObjectRollout | None, *, has_splats: bool) -> None:
         """Lay the grid where the rollout's ground is; a grid that is mere decoration stays.
 
         Before a picture of the scene there is none: that shows what the hands are above.
@@ -172,7 +175,8 @@ class SceneDrawing:
         height = recorded if rollout is None else rollout.parameters.ground_height
         is_there = height is not None or recorded is None
         if height is not None:
-            self._nodes.lift("/ground", height - 0.001 * self._framing.extent)
+            sunk = _SUNK_FOR_SPLATS if has_splats else _SUNK
+            self._nodes.lift("/ground", height - sunk * self._framing.extent)
         is_visible = self.layers.ground and is_there and self.layers.looks_from is None
         self._nodes.show("/ground", is_visible=is_visible)
 
@@ -315,4 +319,4 @@ def add_ground(
     cell = grid_cell(extent)
     x, y = (round(float(framing.center[axis]) / cell) * cell for axis in (0, 1))
     count = int(np.ceil(4 * extent / cell))
-    nodes.ground(name, (x, y, float(height) - 0.001 * extent), cell, count)
+    nodes.ground(name, (x, y, float(height) - _SUNK * extent), cell, count)

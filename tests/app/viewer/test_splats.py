@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -195,6 +196,12 @@ def test_a_playing_frame_of_many_splats_is_small(server, catalog) -> None:
         for frame in range(1, 7):
             scene.draw(frame, take, frame, is_playing=True)
             hear_all(server, client)
+        # What lies on the ground reaches below it, and no line of the grid may be seen through it.
+        ground: Any = server.scene._handle_from_node_name["/ground"]
+        deep, extent = ground.position[2], frame_content(content).extent
+        scene.layers.splats, scene.layers.surface = False, True
+        scene.draw(7, take, 7, is_playing=True)
+        assert ground.position[2] - deep == pytest.approx(0.014 * extent, rel=1e-3)
         moved = client.positions["/object/splats/000"]
         assert np.isfinite(moved).all()
         assert 3_000 < (client.bytes_received - before) / 6 < 40_000
