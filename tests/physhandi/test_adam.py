@@ -73,3 +73,16 @@ def test_the_first_step_has_the_size_that_is_asked_for() -> None:
     (3.0 * value[0] - 1e-3 * value[1]).backward()
     adam.step(0.5)
     assert value.tolist() == pytest.approx([0.95, -1.95], rel=1e-4)
+
+
+def test_rows_that_became_something_else_move_as_at_the_start() -> None:
+    value = torch.ones(3, requires_grad=True)
+    adam = Adam([(value, 0.1)], betas=(0.9, 0.99))
+    for slope in (1.0, -3.0):
+        value.grad = torch.full((3,), slope)
+        adam.step()
+    adam.forget(torch.tensor([1]))
+    state = adam.state()
+    assert state["adam.0.first"][1] == state["adam.0.second"][1] == 0.0
+    assert state["adam.0.first"][0] == pytest.approx(0.9 * 0.1 - 0.1 * 3.0)
+    assert state["adam.0.second"][2] == pytest.approx(0.99 * 0.01 + 0.01 * 9.0)
