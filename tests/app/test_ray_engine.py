@@ -69,7 +69,6 @@ class ClusterDesk:
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[MadeCluster]:
     monkeypatch.setattr(ray_engine, "_INTERVAL_S", 0.0)
-    monkeypatch.setattr(cluster_module, "_TIMEOUT_S", LIMIT_S)
     with made_cluster() as made:
         yield made
 
