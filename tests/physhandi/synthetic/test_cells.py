@@ -154,7 +154,7 @@ def test_a_look_is_fitted_once_for_all_methods_unless_the_order_leaves_it_out(
     # Methods themselves do not fit it, and it is found again.
     made = Run.open(tmp_path / "out/cells" / still.run)
     assert not made.config["profile"]["appearance"]["enabled"]
-    assert made.config["profile"]["appearance"]["iterations"] == 600
+    assert made.config["profile"]["appearance"]["iterations"] == 300
     written = look.stat().st_mtime_ns
     again = Bench(tmp_path / "out", common=common, device="cpu", progress=NullProgress())
     assert again.look(recording) == look
