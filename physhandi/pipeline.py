@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.appearance.lpips import user_lpips
 from physhandi.appearance.scoring import add_picture_scores, picture_curves
 from physhandi.data.attempt import Attempt, ResultStore
 from physhandi.data.checkpoint import Checkpointer
@@ -142,7 +143,10 @@ def reconstruct(
         MissingInputError: If the sequences have neither hands nor an object to fit.
         FitError: If an optimisation has no usable result.
         CancelledError: If the user asked to stop.
+        UsageError: If the weights for LPIPS that the user names cannot be used.
     """
+    if config.appearance.enabled:
+        user_lpips()  # Says what is wrong with the weights before the fit, not after it.
     config = config.replace(object_=config.object_.on(device))
     devices = (device, *more_devices)
     keeper = partial(attempt.checkpointer, _origin_of(sequences, config, devices))
@@ -463,6 +467,9 @@ def evaluate(
         progress: Told about every frame that is drawn.
         draws: Whether pictures are compared too, if the run holds splats.
         device: Warp device that draws.
+
+    Raises:
+        UsageError: If the weights for LPIPS that the user names cannot be used.
     """
     scores = {}
     for sequence in sequences:
@@ -798,7 +805,15 @@ def _compare_pictures(
     if splats is None:
         return
     rollout = artefacts.load_array(out / SequenceFiles(sequence.name).rollout)
-    curves = picture_curves(sequence, rollout, splats, progress, stage=EVALUATION, device=device)
+    curves = picture_curves(
+        sequence,
+        rollout,
+        splats,
+        progress,
+        stage=EVALUATION,
+        device=device,
+        perceptual=user_lpips(device),
+    )
     splits = {
         "reconstruction": sequence.reconstruction_frames,
         "future": sequence.future_frames,

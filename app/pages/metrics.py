@@ -20,9 +20,11 @@ _COUNTS = {"frames", "count", "scored", "seed", "keypoints"}
 _ABOUT = (
     ("phystwin_psnr", "As PhysTwin: first view, whole image with its black background."),
     ("phystwin_ssim", "As PhysTwin: first view, whole image with its black background."),
+    ("phystwin_lpips", "As PhysTwin: first view, whole image with its black background."),
     ("phystwin_iou", "As PhysTwin: first view, any trace of the picture counts as covered."),
     ("psnr", "Pictures against the recording, only where the object or its picture is."),
     ("ssim", "Structural similarity of pictures, only where the object or its picture is."),
+    ("lpips", "How different a network finds them, only where the object or its picture is."),
     ("proper_iou", "Silhouettes of picture and mask, without the hands, in all views."),
     ("held_out_iou", "Silhouettes of picture and mask, in views that no fit saw."),
     ("chamfer_dynamic", "Only over observed points that move more than 10 mm from frame 0."),

@@ -21,6 +21,7 @@ _SPELLINGS = {
     "iou": "IoU",
     "psnr": "PSNR",
     "ssim": "SSIM",
+    "lpips": "LPIPS",
     "rrd": "RRD",
     "mpjpe": "MPJPE",
     "phystwin": "PhysTwin",

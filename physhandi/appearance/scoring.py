@@ -17,13 +17,19 @@ from physhandi.appearance.rasterise import render_splats
 from physhandi.appearance.splats import Splats
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
-from physhandi.metrics.photometric import ImageScores, phystwin_scores, proper_scores
+from physhandi.metrics.photometric import (
+    ImageScores,
+    Perceptual,
+    phystwin_scores,
+    proper_scores,
+)
 from physhandi.progress import NullProgress, Progress
 
 PHYSTWIN, PROPER, HELD_OUT = "phystwin", "proper", "held_out"
 """PhysTwin's scores in the first view that has masks; proper ones as the mean over all views that
 have masks, those that are held out among them; and proper ones in those that are held out alone."""
 PICTURE_SCORES = ("psnr", "ssim", "iou")
+"""Scores that need nothing more; ``lpips`` needs a network."""
 PictureCurves = dict[str, dict[str, Float[ndarray, " frame"]]]
 """Scores of every frame by definition and name; NaN where a frame cannot be compared."""
 
@@ -46,6 +52,7 @@ def picture_curves(
     *,
     stage: str = "",
     device: str = "cpu",
+    perceptual: Perceptual | None = None,
 ) -> PictureCurves:
     """Draw every frame of a rollout in every view that has masks, and compare.
 
@@ -56,6 +63,7 @@ def picture_curves(
         progress: Told about every frame, as part of `stage`; may cancel.
         stage: Stage that this belongs to.
         device: Warp device that draws.
+        perceptual: Network for ``lpips``; None leaves that score out.
 
     Returns:
         Curves of `PHYSTWIN` and `PROPER`, and of `HELD_OUT` if there is such a view; nothing if no
@@ -68,9 +76,8 @@ def picture_curves(
         return {}
     frame_count = min(len(rollout), sequence.frame_count)
     names = (PHYSTWIN, PROPER, *([HELD_OUT] if aside else []))
-    curves = {
-        name: {score: np.full(len(rollout), np.nan) for score in PICTURE_SCORES} for name in names
-    }
+    scores = PICTURE_SCORES if perceptual is None else (*PICTURE_SCORES, "lpips")
+    curves = {name: {score: np.full(len(rollout), np.nan) for score in scores} for name in names}
     binding = SplatBinding.of(splats)
     for frame in range(frame_count):
         progress.check_cancelled()
@@ -78,9 +85,9 @@ def picture_curves(
         proper: list[ImageScores] = []
         for view in (*seen, *aside):
             parts = _picture(view, frame, splats, center, device)
-            proper.append(proper_scores(*parts))
+            proper.append(proper_scores(*parts, perceptual))
             if view is seen[0]:
-                _note(curves[PHYSTWIN], frame, [phystwin_scores(*parts)])
+                _note(curves[PHYSTWIN], frame, [phystwin_scores(*parts, perceptual)])
         _note(curves[PROPER], frame, proper)
         if aside:
             _note(curves[HELD_OUT], frame, proper[len(seen) :])
@@ -132,7 +139,7 @@ def _note(
     curves: dict[str, Float[ndarray, " frame"]], frame: int, scores: list[ImageScores]
 ) -> None:
     for name, curve in curves.items():
-        mean = _mean(np.array([getattr(score, name) for score in scores]))
+        mean = _mean(np.array([getattr(score, name) for score in scores], np.float64))
         curve[frame] = np.nan if mean is None else mean
 
 

@@ -1,4 +1,4 @@
-"""Pictures of the object against its recording: PSNR, SSIM and IoU by two definitions.
+"""Pictures of the object against its recording: PSNR, SSIM, IoU and LPIPS by two definitions.
 
 Both take a picture of the object alone, drawn over black, and what a camera recorded.
 `phystwin_scores` follows PhysTwin's evaluation, in which the black background counts;
@@ -6,7 +6,7 @@ Both take a picture of the object alone, drawn over black, and what a camera rec
 colors of points from views.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
 import cv2
@@ -30,6 +30,15 @@ _BEHIND = 0.015
 _STRAIGHT, _LEAST_COSINE = 4, 0.05
 """Power of the cosine by which views count that look at a surface, and the least such cosine."""
 _FULL = 255.0
+Perceptual = Callable[
+    [
+        Float[ndarray, "row column 3"],
+        Float[ndarray, "row column 3"],
+        Bool[ndarray, "row column"] | None,
+    ],
+    float,
+]
+"""Network that compares two images (sRGB, 0 to 1), over some pixels or as a whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +51,12 @@ class ImageScores:
     """Structural similarity, at most 1."""
     iou: float
     """Intersection over union of the silhouettes."""
+    lpips: float | None = None
+    """Perceptual distance, 0 for equal images; None without the network."""
 
     def to_dict(self) -> dict[str, float]:
-        """Give the scores by name."""
-        return asdict(self)
+        """Give the scores by name, ``lpips`` only with the network."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def phystwin_scores(
@@ -53,6 +64,7 @@ def phystwin_scores(
     alpha: Float[ndarray, "row column"],
     mask: UInt8[ndarray, "row column"],
     recorded: UInt8[ndarray, "row column 3"] | None,
+    perceptual: Perceptual | None = None,
 ) -> ImageScores:
     """Compare as PhysTwin's evaluation does: the whole image, with its black background.
 
@@ -64,6 +76,7 @@ def phystwin_scores(
         alpha: How far it covers each pixel, 0 to 1.
         mask: Labels of the recording: 0 background, 1 object, larger ones hands.
         recorded: The recorded image (sRGB); None if there is none: then only the IoU is known.
+        perceptual: Network for LPIPS; None leaves it unknown.
     """
     is_object, is_hand = mask == OBJECT, mask > OBJECT
     is_drawn = (np.rint(_FULL * np.clip(alpha, 0.0, 1.0)) > 0) & ~is_hand
@@ -77,7 +90,10 @@ def phystwin_scores(
     similarity = structural_similarity(seen[rows, columns], shown[rows, columns])
     missing = float(np.sum(1.0 - similarity.mean(axis=2)))
     return ImageScores(
-        psnr=psnr(((seen - shown) ** 2).mean()), ssim=1.0 - missing / mask.size, iou=iou
+        psnr=psnr(((seen - shown) ** 2).mean()),
+        ssim=1.0 - missing / mask.size,
+        iou=iou,
+        lpips=None if perceptual is None else perceptual(seen, shown, None),
     )
 
 
@@ -86,18 +102,20 @@ def proper_scores(
     alpha: Float[ndarray, "row column"],
     mask: UInt8[ndarray, "row column"],
     recorded: UInt8[ndarray, "row column 3"] | None,
+    perceptual: Perceptual | None = None,
 ) -> ImageScores:
     """Compare only what belongs to the object: pixels that its mask or its picture covers.
 
     Pixels of hands count nowhere, since nobody sees what the object looks like behind them. A pixel
-    that is covered in one image alone is compared with black. SSIM is the mean over counted pixels;
-    its windows reach into pixels that do not count, which are black in both images.
+    that is covered in one image alone is compared with black. SSIM and LPIPS are means over counted
+    pixels; what they look at reaches into pixels that do not count, which are black in both images.
 
     Args:
         color: The object alone over black (sRGB, 0 to 1).
         alpha: How far it covers each pixel, 0 to 1; it counts as covered from `LEAST_ALPHA` on.
         mask: Labels of the recording: 0 background, 1 object, larger ones hands.
         recorded: The recorded image (sRGB); None if there is none: then only the IoU is known.
+        perceptual: Network for LPIPS; None leaves it unknown.
 
     Returns:
         NaN if no pixel counts.
@@ -113,10 +131,17 @@ def proper_scores(
     seen = _on_black(recorded[rows, columns] / _FULL, is_object[rows, columns])
     shown = _on_black(np.clip(color[rows, columns], 0.0, 1.0), counted)
     similarity = structural_similarity(seen, shown)[counted]
+    distance = None
+    if perceptual is not None:
+        whole = np.clip(color, 0.0, 1.0)
+        distance = perceptual(
+            _on_black(recorded / _FULL, is_object), _on_black(whole, is_counted), is_counted
+        )
     return ImageScores(
         psnr=psnr(((seen - shown)[counted] ** 2).mean()),
         ssim=float(similarity.mean()),
         iou=iou,
+        lpips=distance,
     )
 
 

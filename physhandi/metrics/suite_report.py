@@ -53,6 +53,7 @@ _PAPER = (
     ("track_error_phystwin", "Track [cm]", _CM, 2),
     ("iou", "IoU ↑", 1.0, 3),
     ("psnr", "PSNR ↑", 1.0, 2),
+    ("lpips", "LPIPS", 1.0, 3),
 )
 _PROPER = (
     ("chamfer_dynamic_symmetric", "CD_dyn sym. [mm]", _MM, 2),
@@ -65,11 +66,13 @@ _PICTURES = (
     ("iou_proper", "IoU ↑", 1.0, 3),
     ("psnr_proper", "PSNR ↑", 1.0, 2),
     ("ssim_proper", "SSIM ↑", 1.0, 3),
+    ("lpips_proper", "LPIPS", 1.0, 3),
 )
 _HELD_OUT = (
     ("iou_held_out", "IoU ↑", 1.0, 3),
     ("psnr_held_out", "PSNR ↑", 1.0, 2),
     ("ssim_held_out", "SSIM ↑", 1.0, 3),
+    ("lpips_held_out", "LPIPS", 1.0, 3),
 )
 _CONTACT = (
     ("contact_accuracy_5mm", "accuracy 5 mm ↑", 1.0, 3),

@@ -211,19 +211,24 @@ def _refuse_download(*_arguments: object, **_options: object) -> None:
     raise UsageError("its code wants to download something; nothing is downloaded here")
 
 
-def _weights(path: Path) -> Any:
-    """Read tensors without executing anything."""
+def read_weights(path: Path) -> dict[str, Any]:
+    """Read tensors of safetensors or PyTorch by their names, without executing anything.
+
+    Raises:
+        UsageError: If the file holds something else, or is damaged.
+    """
     import torch
+    from safetensors.torch import load_file
 
-    if path.suffix == ".safetensors":
-        from safetensors.torch import load_file
-
-        return load_file(path)
     try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
         stored: Any = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # noqa: BLE001 - a broken file can raise nearly anything
         reason = " ".join(str(error).split())[:200]
         raise UsageError(f"{path.name} cannot be read as plain tensors ({reason})") from None
+    if not isinstance(stored, dict):
+        raise UsageError(f"{path.name} holds no tensors by name")
     return stored.get("state_dict", stored.get("model", stored))
 
 
@@ -235,7 +240,7 @@ def _cotracker(folder: Path, checkpoint: Path) -> Callable[..., _Paths]:
     import torch
 
     predictor: Any = torch.hub.load(str(folder), _ENTRY, source="local", pretrained=False)
-    predictor.model.load_state_dict(_weights(checkpoint))
+    predictor.model.load_state_dict(read_weights(checkpoint))
     device = "cuda" if torch.cuda.is_available() else "cpu"
     predictor = predictor.to(device).train(False)
 
@@ -270,7 +275,7 @@ def _tapnext(folder: Path, checkpoint: Path) -> Callable[..., _Paths]:
         tools = importlib.import_module("tapnet.tapnext.tapnext_torch_utils")
         model = tools.restore_model_from_jax_checkpoint(model, str(checkpoint))
     else:
-        stored = _weights(checkpoint)
+        stored = read_weights(checkpoint)
         model.load_state_dict({name.removeprefix("tapnext."): x for name, x in stored.items()})
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = model.to(device).train(False)

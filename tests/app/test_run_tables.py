@@ -63,7 +63,7 @@ def test_scores_of_pictures_have_rows_of_their_own_and_their_look_a_table() -> N
             "rollout": {
                 "chamfer_l2": 0.01,
                 "photometric": {
-                    "phystwin": {"psnr": 31.0, "ssim": 0.9, "iou": 0.5},
+                    "phystwin": {"psnr": 31.0, "ssim": 0.9, "iou": 0.5, "lpips": 0.25},
                     "held_out": {"psnr": 20.0, "ssim": 0.8, "iou": 0.75},
                 },
             },
@@ -81,6 +81,9 @@ def test_scores_of_pictures_have_rows_of_their_own_and_their_look_a_table() -> N
     assert cells(rows["photometric_held_out_iou"]) == [("75.00", False), (DASH, False)]
     assert rows["photometric_held_out_iou"]["unit"] == "%"
     assert rows["photometric_phystwin_iou"]["about"].startswith("As PhysTwin")
+    lpips = rows["photometric_phystwin_lpips"]
+    assert (lpips["unit"], lpips["is_higher_better"]) == ("", False)
+    assert cells(lpips) == [("0.2500", False), (DASH, False)]
     assert "no fit saw" in rows["photometric_held_out_iou"]["about"]
     assert about_quantity("photometric.phystwin.psnr").startswith("As PhysTwin")
     assert cells(rows["chamfer_l2"]) == [("10.00", True), ("20.00", False)]

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from filmed_sheet import write_filmed_sheet
+from lpips_weights import write_lpips
 from sheet_sequence import FRAMES, NODE, sheet_config
 from stopped_fits import Stopper, write_always
 
 from physhandi import pipeline
 from physhandi.appearance.splats import Splats
 from physhandi.data.layout import SPLATS_FILE
-from physhandi.errors import CancelledError
+from physhandi.errors import CancelledError, UsageError
 from physhandi.fitting.config import APPEARANCE, EVALUATION, STAGES, PipelineConfig
 from physhandi.run import Run
 
@@ -104,6 +105,30 @@ def test_metrics_have_both_definitions_in_every_split_and_those_of_the_held_out_
     without = pipeline.evaluate(fitted, [_sequence(fitted)], draws=False)["sheet"]
     assert "photometric" not in without
     assert without["future"]["static"] == scores["future"]["static"]
+
+
+def test_lpips_is_measured_with_the_weights_of_the_user(
+    fitted: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PHYSHANDI_LPIPS", str(write_lpips(tmp_path)))
+    measured = pipeline.evaluate(fitted, [_sequence(fitted)])["sheet"]
+    for split in ("reconstruction", "future"):
+        found = measured[split]["rollout"]["photometric"]
+        before = fitted.metrics["sheet"][split]["rollout"]["photometric"]
+        for definition, scores in found.items():
+            assert scores.pop("lpips") > 0.001
+            assert scores == before[definition]
+    assert measured["photometric"]["held_out"]["lpips"] > 0.001
+
+
+def test_weights_that_cannot_be_used_stop_a_fit_before_it_begins(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PHYSHANDI_LPIPS", str(tmp_path / "none"))
+    told = Stopper()
+    with pytest.raises(UsageError, match=r"PHYSHANDI_LPIPS: .*none must hold one file alexnet\*"):
+        pipeline.run_job(new_run(tmp_path / "fit", recording, config_of()), told)
+    assert told.reports == []
 
 
 def _sequence(run: Run) -> pipeline.Sequence:

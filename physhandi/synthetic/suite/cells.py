@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -19,6 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from safetensors.numpy import save
 
+from physhandi.appearance.lpips import Lpips, user_lpips
 from physhandi.appearance.scoring import (
     PHYSTWIN,
     PictureCurves,
@@ -54,6 +56,7 @@ from physhandi.errors import (
     SimulationError,
     UsageError,
 )
+from physhandi.metrics.photometric import Perceptual
 from physhandi.metrics.report import measure_run
 from physhandi.metrics.truth_metrics import true_surface
 from physhandi.progress import Progress
@@ -298,6 +301,8 @@ class Bench:
         parts = [reference.folder.name, "" if run is None else run.folder.name]
         parts += ["" if look is None else look.name]
         parts += [str(len(recording.reconstruction_frames)), code_version(SCORES)]
+        perceptual = None if look is None else self._perceptual
+        parts += [] if perceptual is None else [perceptual.sha256]
         key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
         path = self.out / "scores" / f"{key}.json"
         try:
@@ -312,11 +317,16 @@ class Bench:
                 splats=None if look is None else read_look(look),
                 progress=self.progress,
                 device=self.device,
+                perceptual=perceptual,
             )
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, {"report": report, "curves": curves})
             stored = checked(read_json(path), StoredScores, path)
         return stored["report"], stored["curves"]
+
+    @cached_property
+    def _perceptual(self) -> Lpips | None:
+        return user_lpips(self.device)
 
     def look(self, recording: Sequence) -> Path | None:
         """Fit what the object of a recording looks like, once for all methods, or find it fitted.
@@ -510,6 +520,7 @@ def measure_cell(
     splats: Splats | None = None,
     progress: Progress | None = None,
     device: str = "cpu",
+    perceptual: Perceptual | None = None,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Score a run's prediction.
 
@@ -523,6 +534,7 @@ def measure_cell(
         splats: What its object looks like; None compares no pictures.
         progress: Told about every frame that is drawn.
         device: Warp device that draws.
+        perceptual: Network for LPIPS of pictures; None leaves it out.
 
     Returns:
         The report and the errors of the rollout frame by frame.
@@ -541,6 +553,7 @@ def measure_cell(
             progress,
             stage="pictures",
             device=device,
+            perceptual=perceptual,
         )
         add_photometric(report, curves, measured, recording)
     return report, curves
@@ -577,8 +590,8 @@ def add_photometric(
 ) -> None:
     """Add what pictures of the rollout score to its other figures.
 
-    By PhysTwin's definition figures are called ``psnr``, ``ssim`` and ``iou``; those of proper
-    scores end in ``_proper``, and in ``_held_out`` where they are of held-out views alone.
+    By PhysTwin's definition figures are called ``psnr``, ``ssim``, ``iou`` and ``lpips``; those of
+    proper scores end in ``_proper``, and in ``_held_out`` where they are of held-out views alone.
     """
     splits = {
         "reconstruction": recording.reconstruction_frames,

@@ -45,7 +45,7 @@ _HANDS = {"chamfer_symmetric": "hand_chamfer", "mpjpe": "mpjpe", "surface_error"
 _PICTURES = tuple(
     f"{score}{definition}"
     for definition in ("", "_proper", "_held_out")
-    for score in ("iou", "psnr", "ssim")
+    for score in ("iou", "psnr", "ssim", "lpips")
 )
 _TOPOLOGY = ("rrd_object", "rrd_virtual")
 Figures = dict[str, dict[str, float]]

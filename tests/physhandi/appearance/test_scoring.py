@@ -153,6 +153,22 @@ def test_splats_go_along_with_the_nodes_of_any_method(seen: Sequence) -> None:
     np.testing.assert_allclose(found["proper"]["psnr"], coarse["proper"]["psnr"], atol=1e-3)
 
 
+def test_a_network_adds_its_own_score_beside_the_others(seen: Sequence) -> None:
+    def network(one: np.ndarray, other: np.ndarray, where: np.ndarray | None) -> float:
+        return float(np.abs(one - other)[slice(None) if where is None else where].mean())
+
+    node = rollout(STEP, square(0.02))
+    without = picture_curves(seen, node, red_square())
+    found = picture_curves(seen, node, red_square(), perceptual=network)
+    for name, by_score in found.items():
+        assert list(by_score) == ["psnr", "ssim", "iou", "lpips"]
+        for score, curve in without[name].items():
+            np.testing.assert_array_equal(by_score[score], curve)
+    # Red where it is green: 200, 80 and 40 of 255 off, as the mean of three channels.
+    assert found["held_out"]["lpips"][1] == pytest.approx(320 / 3 / 255, abs=0.03)
+    assert found["phystwin"]["lpips"][1] < 0.02
+
+
 def test_reports_have_frame_0_by_itself_and_the_mean_of_each_split(seen: Sequence) -> None:
     curves = picture_curves(seen, rollout(0 * STEP, square(0.02)), red_square())
     report = {"reconstruction": {"rollout": {}}, "future": {"rollout": {}}}

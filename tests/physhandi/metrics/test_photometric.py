@@ -207,3 +207,26 @@ def test_with_normals_pixels_at_the_outline_lend_no_color(view: View) -> None:
     up = np.tile([0.0, 0.0, 1.0], (2, 1))
     assert seen_colors([view], rim)[0].tolist() == [0, 255, 0]
     assert seen_colors([view], rim, up).tolist() == [list(RED), list(RED)]
+
+
+def test_a_network_is_shown_what_each_definition_compares() -> None:
+    """A made-up network, the mean difference of the red, tells what it is given."""
+    color, alpha, mask, recorded = pictures()
+    is_object, is_hand = mask == 1, mask > 1
+
+    def network(one: np.ndarray, other: np.ndarray, where: np.ndarray | None) -> float:
+        difference = np.abs(one - other)[..., 0]
+        return float(difference.mean() if where is None else difference[where].mean())
+
+    red = recorded[..., 0] / 255 * is_object
+    rounded = np.rint(255 * color[..., 0]) / 255 * ~is_hand
+    whole = phystwin_scores(color, alpha, mask, recorded, network)
+    assert whole.to_dict()["lpips"] == pytest.approx(np.abs(red - rounded).sum() / mask.size)
+    is_counted = is_object | ((alpha >= 0.5) & ~is_hand)
+    proper = proper_scores(color, alpha, mask, recorded, network)
+    expected = np.abs(red - color[..., 0])[is_counted].mean()
+    assert proper.to_dict()["lpips"] == pytest.approx(expected)
+    assert expected > 0.001
+    for score in (phystwin_scores, proper_scores):
+        assert list(score(color, alpha, mask, recorded).to_dict()) == ["psnr", "ssim", "iou"]
+        assert score(color, alpha, mask, None, network).lpips is None

@@ -68,7 +68,7 @@ def test_a_difference_is_paired_by_case_so_that_hard_cases_cancel() -> None:
 
 def test_shares_are_better_when_they_are_higher() -> None:
     figures = [("base", 0.8), ("ours", 0.9)]
-    for metric, better in (("contact_f1_5mm", 1), ("psnr", 1), ("iou", 1), ("track_error", 0)):
+    for metric, better in (("contact_f1_5mm", 1), ("psnr", 1), ("iou", 1), ("lpips", 0)):
         (found,) = compare([score(m, "x", v, metric) for m, v in figures], "base")
         assert found.difference == pytest.approx(0.1)
         assert found.better == better

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from filmed_sheet import write_filmed_sheet
+from lpips_weights import write_lpips
 from sheet_sequence import FITTED, NODE, write_sheet
 from suite_world import SETTINGS
 
@@ -136,7 +137,7 @@ def test_figures_of_pictures_are_named_by_their_definition(seen: Sequence) -> No
 
 
 def test_a_look_is_fitted_once_for_all_methods_unless_the_order_leaves_it_out(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording = write_filmed_sheet(tmp_path / "sheet")
     common = {"appearance.splat_count": 200, "appearance.iterations": 4}
@@ -164,6 +165,16 @@ def test_a_look_is_fitted_once_for_all_methods_unless_the_order_leaves_it_out(
     outcome = without.outcome(METHODS["static"], recording)
     assert "iou" not in outcome.report["future"]["rollout"]
     assert not (tmp_path / "off/looks").exists()
+    # With weights for LPIPS it is measured again; everything else stays.
+    assert "lpips" not in still.curves
+    monkeypatch.setenv("PHYSHANDI_LPIPS", str(write_lpips(tmp_path / "lpips")))
+    more = Bench(tmp_path / "out", common=common, device="cpu", progress=NullProgress())
+    found = more.outcome(METHODS["static"], recording)
+    for metric in ("lpips", "lpips_proper", "lpips_held_out"):
+        curve = found.curves[metric]
+        assert curve[-1] > curve[0] > 0.0
+        assert found.report["future"]["rollout"][metric] > 0.0
+    assert found.curves["psnr"] == still.curves["psnr"]
     look.write_bytes(b"torn")
     with pytest.raises(RunError, match=look.name):
         read_look(look)
