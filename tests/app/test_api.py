@@ -217,7 +217,7 @@ def test_live_scenes_are_opened_and_closed(world: World) -> None:
         assert opened.status_code == 201
         session = opened.json()
         assert session["url"] == f"/live/{session['id']}"
-        assert f"/viewer/{session['id']}/" in client.get(session["url"]).text
+        assert f"viewer/{session['id']}/" in client.get(session["url"]).text
         assert client.get(f"/viewer/{session['id']}/").status_code == 200
         for _ in range(2):
             assert client.delete(f"/api/v1/sessions/{session['id']}").status_code == 204

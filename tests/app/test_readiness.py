@@ -86,7 +86,7 @@ def test_the_command_line_warns_before_it_begins(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
 
-    def begin(run: Run, device: str) -> dict[str, Any]:
+    def begin(run: Run, device: str, store: None) -> dict[str, Any]:
         raise RunError("it began")
 
     monkeypatch.setattr(runs, "_execute", begin)

@@ -136,7 +136,7 @@ def test_a_log_and_a_preview_are_given(old: OldFolder, client: TestClient) -> No
 
 
 def test_a_suite_is_listed_with_its_figures(old: OldFolder, world: World) -> None:
-    assert "/suites/small" in world.browser().get("/suites").text
+    assert "suites/small" in world.browser().get("/suites").text
     page = world.browser().get("/suites/small").text
     with (old.path / "suites/small/table.csv").open() as stream:
         rows = list(csv.DictReader(stream))

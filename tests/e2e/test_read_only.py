@@ -68,6 +68,12 @@ _PRESS_ALL = """(names) => {
 _EMPTY_SCENE = re.compile("/viewer/")
 
 
+@pytest.fixture(scope="module")
+def served(own_server: Any) -> Any:
+    """A server with no runs of other tests, which would be offered too."""
+    return own_server
+
+
 @pytest.fixture
 def shown(served: Any) -> Iterator[None]:
     """A run that may be deleted, and one that is damaged."""
