@@ -48,6 +48,7 @@ from app.security import Gatekeeper, Security
 from app.settings import WEB_ASSETS, ServerSettings
 from app.slow_requests import ImpatientProtocol
 from app.viewer.gate import create_gate
+from app.viewer.physics.edit_presets import EditPresetStore
 from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
 from app.viewer.sessions import Sessions, TooManySessionsError
@@ -216,7 +217,8 @@ def _storage(
     """Say where live scenes keep what their users make, and where it is noted."""
     saver = RunSaver(catalog, settings.run_dir, scheduler.start_now, settings.sequence_dir)
     presets = PresetStore(settings.data_dir / "presets")
-    return UserStorage(presets, saver, audit_log.note_scene)
+    edit_presets = EditPresetStore(presets.folder)
+    return UserStorage(presets, edit_presets, saver, audit_log.note_scene)
 
 
 def _guard(

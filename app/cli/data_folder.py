@@ -71,14 +71,16 @@ def look_through(data_dir: Path | None) -> Iterator[tuple[bool, str]]:
 def _other_problems(settings: ServerSettings) -> Iterator[str]:
     # Every command imports this file; these import what draws.
     from app.exports.shares import Shares
+    from app.viewer.physics.edit_presets import EditPresetStore
     from app.viewer.physics.presets import PresetStore
 
     try:
         read_mapping(settings.launches_path)
     except RunError as error:
         yield f"keys of launches: {error}"
-    for problem in PresetStore(settings.data_dir / "presets").presets()[1]:
-        yield f"preset: {problem}"
+    folder = settings.data_dir / "presets"
+    for store in (PresetStore(folder), EditPresetStore(folder)):
+        yield from (f"{store.what}: {problem}" for problem in store.presets()[1])
     for problem in Shares(settings.data_dir / "shares").problems():
         yield f"shared page: {problem}"
     if not os.access(settings.data_dir, os.R_OK | os.W_OK | os.X_OK):

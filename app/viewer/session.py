@@ -201,6 +201,8 @@ class Session(SceneServer):
         self._playback.close()
         if self._steer is not None:
             self._steer.close()
+        if self._edit is not None:
+            self._edit.close()
         if self._object is not None:
             self._object.close()
         self._comparison.close()
@@ -310,8 +312,9 @@ class Session(SceneServer):
             self._playback,
             tabs=self._tabs,
             framing=framing,
-            surface=content.surface,
+            content=content,
             physics=self._object.panel,
+            storage=self._storage,
             rollout_at=self._object.at,
             leave_others=self._leave_others,
         )

@@ -380,8 +380,9 @@ def test_the_doctor_tells_what_is_damaged_and_what_is_left(
     terminal, data = Terminal(tmp_path, capsys), damaged.settings.data_dir
     (data / "launches.json").write_text("[" * 3000)
     (data / "runs/whole" / named_for(dead_process(), "x.json")).write_text("x")
-    (data / "presets").mkdir()
+    (data / "presets/edits").mkdir(parents=True)
     (data / "presets/a.yaml").write_text("[")
+    (data / "presets/edits/b.json").write_text("[")
     (data / "shares/b").mkdir(parents=True)
     before = tree(data)
     code, out, _ = terminal("doctor", "--data-dir", data)
@@ -390,9 +391,15 @@ def test_the_doctor_tells_what_is_damaged_and_what_is_left(
     failed = [line for line in out.splitlines() if line.startswith("FAIL")]
     for name, (_, words) in RUNS.items():
         assert any(line.startswith(f"FAIL  runs/{name}: ") and words in line for line in failed)
-    for words in ("sequences/bad: ", "launches.json", "a.yaml", "share.json"):
+    for words in (
+        "sequences/bad: ",
+        "launches.json",
+        "presets/a.yaml",
+        "presets/edits/b.json",
+        "share.json",
+    ):
         assert any(words in line for line in failed), words
-    assert len(failed) == len(RUNS) + 4
+    assert len(failed) == len(RUNS) + 5
     assert "has 6 runs and 2 sequences, 6 of them damaged" in out
     assert "note  1 were left unfinished" in out
 

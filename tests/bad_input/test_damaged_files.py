@@ -31,6 +31,7 @@ from app.jobs.views import (
 from app.pages import suites
 from app.pages.metrics import tabulate
 from app.pages.parameters import parameter_rows
+from app.viewer.physics.edit_presets import EditPresetStore
 from app.viewer.physics.presets import PresetStore
 from physhandi.data.files import plain
 from physhandi.data.lease import live_holder
@@ -117,6 +118,11 @@ def look_at_presets(folder: Path) -> None:
     assert len(presets) + len(problems) == 1
 
 
+def look_at_edit_presets(folder: Path) -> None:
+    presets, problems = EditPresetStore(folder / "presets").presets()
+    assert len(presets) + len(problems) == 1
+
+
 def look_at_suite(folder: Path) -> None:
     """Ask for what the page of a suite shows, and begin to go on with it."""
     assert suites._described(folder)["name"] == folder.name
@@ -148,6 +154,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "shares/a/share.json": look_at_shares,
     "index.json": look_at_index,
     "presets/wet.yaml": look_at_presets,
+    "presets/edits/torn.json": look_at_edit_presets,
     "cells.json": look_at_suite,
     "table.csv": look_at_suite,
     "sequence.yaml": look_at_sequence,
@@ -174,6 +181,15 @@ def folder(fitted: Path, sheet: Path) -> Path:
     preset = {"format": "physhandi-preset/1", "name": "Wet", "parameters": {"drag": 6.0}}
     (fitted / "presets").mkdir()
     (fitted / "presets/wet.yaml").write_text(json.dumps(preset))
+    torn = {
+        "format": "physhandi-edit-preset/1",
+        "name": "Torn",
+        "object": {"nodes": 9, "springs": 12, "sha256": "0" * 64},
+        "recording": {"name": "sheet", "frames": 4, "controls": 2},
+        "edits": [{"kind": "cut", "springs": [[0, 1]]}],
+    }
+    (fitted / "presets/edits").mkdir()
+    (fitted / "presets/edits/torn.json").write_text(json.dumps(torn))
     figures = {"main": {"track_error": 0.01, "chamfer_l2": None}}
     cell = {
         "method": "a",

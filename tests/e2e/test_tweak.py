@@ -98,7 +98,7 @@ def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
         scene.tab(name)
         assert scene.panel.get_by_role("tab", name=name).evaluate(_HANGS_OVER) <= 0, name
     page.keyboard.press("v")
-    for name in ("Export", "Inspect", "Look", "Play"):
+    for name in ("Export", "Inspect", "Edit", "Look", "Play"):
         tab = scene.panel.get_by_role("tab", name=name, exact=True)
         tab.focus()
         page.keyboard.press("Enter")

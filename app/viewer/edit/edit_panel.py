@@ -11,6 +11,8 @@ import viser
 from numpy import ndarray
 
 from app.viewer.clock.playback import Playback
+from app.viewer.content.content import Content
+from app.viewer.edit.edit_preset_panel import EditPresetPanel
 from app.viewer.edit.selection import (
     Cover,
     DrawnShape,
@@ -28,6 +30,7 @@ from app.viewer.edit.selection import (
     select,
     springs_between,
 )
+from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.panel import PhysicsPanel
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
@@ -48,7 +51,6 @@ from physhandi.simulation.edits import (
     ScaleMaterial,
     apply_edits,
 )
-from physhandi.simulation.object_surface import ObjectSurface
 
 SELECTED = (255, 122, 0)
 """Color of what is selected."""
@@ -86,8 +88,9 @@ class EditPanel:
         *,
         tabs: Tabs,
         framing: Framing,
-        surface: ObjectSurface | None,
+        content: Content,
         physics: PhysicsPanel,
+        storage: UserStorage | None,
         rollout_at: Callable[[int], tuple[ObjectRollout, int]],
         leave_others: Callable[[], None],
     ) -> None:
@@ -99,8 +102,9 @@ class EditPanel:
             playback: The session's clock.
             tabs: Where the controls go.
             framing: Sizes.
-            surface: The object's surface, behind which things can be left out.
+            content: What is shown; behind its surface things can be left out.
             physics: Keeps the edits with its parameters, and has them simulated.
+            storage: Where edits are kept under a name; None where nothing can be kept.
             rollout_at: Finds the rollout of a frame, and which of its frames.
             leave_others: Ends what else takes the pointer or shows another object.
         """
@@ -109,7 +113,7 @@ class EditPanel:
         self._playback = playback
         self._tabs = tabs
         self._spacing = framing.spacing
-        self._surface = surface
+        self._surface = content.surface
         self._physics = physics
         self._rollout_at = rollout_at
         self._leave_others = leave_others
@@ -120,7 +124,18 @@ class EditPanel:
         self._is_on = False
         self._sign = server.gui.add_html("")
         self._callbacks: list[Callable[[viser.SceneRectSelectEvent], None]] = []
+        self._presets: EditPresetPanel | None = None
         self._add_controls(server.gui)
+        if storage is not None and content.fitted is not None:
+            with self._folder:
+                self._presets = EditPresetPanel(
+                    server.gui,
+                    guard,
+                    physics,
+                    fitted=content.fitted,
+                    recording=content.sequence_name,
+                    storage=storage,
+                )
         self._commands = bind(server, guard, "edit", lambda _, __: self.toggle())
         self._write()
 
@@ -261,10 +276,16 @@ class EditPanel:
     def remove(self) -> None:
         """Take the tab's controls away."""
         self.leave()
+        self.close()
         for command in self._commands:
             command.remove()
         self._folder.remove()
         self._sign.remove()
+
+    def close(self) -> None:
+        """Stop listening to what others keep."""
+        if self._presets is not None:
+            self._presets.close()
 
     def _enter(self) -> None:
         self._playback.play(on=False)

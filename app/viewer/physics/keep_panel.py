@@ -14,15 +14,10 @@ from app.jobs.catalog import Catalog
 from app.settings import BUNDLED
 from app.viewer.content.content import Content
 from app.viewer.live.client import LiveRollouts
+from app.viewer.physics.edit_presets import EditPresetStore
 from app.viewer.physics.history import History
-from app.viewer.physics.presets import (
-    AS_FITTED,
-    BY_HAND,
-    Preset,
-    PresetStore,
-    builtin_presets,
-)
-from app.viewer.ui.followed import FollowedChoice
+from app.viewer.physics.kept_choice import KeptChoice, OwnKept, write_small
+from app.viewer.physics.presets import Preset, PresetStore, builtin_presets
 from app.viewer.ui.guard import Guard, notify
 from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.data.run_folder import new_run_id
@@ -245,7 +240,6 @@ def run_changes(
 
 
 _PRESET, _RUN = "Preset", "Run"
-_PROBLEMS = 3
 
 
 @dataclass(frozen=True)
@@ -254,6 +248,8 @@ class UserStorage:
 
     presets: PresetStore
     """Their presets."""
+    edit_presets: EditPresetStore
+    """Their presets of edits."""
     saver: RunSaver
     """Makes runs."""
     note: Callable[[str, str, str | None], None] = lambda _owner, _what, _run: None
@@ -266,7 +262,7 @@ class UserStorage:
         self.note(self.owner, what, None if run is None else run.id)
 
 
-class PresetChoice:
+class PresetChoice(KeptChoice[Preset]):
     """The list of presets in the physics panel."""
 
     def __init__(
@@ -290,58 +286,21 @@ class PresetChoice:
             choose: Called with the parameters of the preset that a user chose, and whether their
                 substeps are automatic.
         """
-        self._history = history
-        self._unit = length_unit
-        self._store = store
-        self._choose = choose
-        self._presets: dict[str, Preset] = {}
-        self._wanted = AS_FITTED
-        self._turn = threading.Lock()
-        self.problems: tuple[str, ...] = ()
-        """What is wrong with files among the users' presets."""
-        choice: Any = gui.add_dropdown(
+
+        def suitable() -> tuple[list[Preset], tuple[str, ...]]:
+            own, problems = store.presets() if store is not None else ((), ())
+            every = (*builtin_presets(), *own)
+            return [p for p in every if p.suits(history.start, length_unit)], problems
+
+        super().__init__(
+            gui,
+            guard,
             "Preset",
-            (AS_FITTED, BY_HAND),
-            hint="Changes made to the fitted parameters, all at once; ★ are your own",
+            "Changes made to the fitted parameters, all at once; ★ are your own",
+            offered=suitable,
+            is_in_force=lambda preset: preset.apply(history.start) == history.setting[:2],
+            choose=lambda preset: choose(*preset.apply(history.start)),
         )
-        choice.on_update(guard.by_user(lambda _: self._take_choice()))
-        self._choice = FollowedChoice(choice, guard)
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Read the users' presets again."""
-        own, self.problems = self._store.presets() if self._store is not None else ((), ())
-        fitted = self._history.start
-        suitable = [p for p in (*builtin_presets(), *own) if p.suits(fitted, self._unit)]
-        self._presets = {preset.label: preset for preset in suitable}
-        self._choice.offer((*self._presets, BY_HAND))
-        self.show()
-
-    def show(self) -> None:
-        """Name the preset in force."""
-        with self._turn:  # What is shown last must be what was read last.
-            chosen = self.chosen
-            self._choice.show(BY_HAND if chosen is None else chosen.label)
-
-    @property
-    def chosen(self) -> Preset | None:
-        """The preset whose parameters are in force, if there is one; of several that was chosen."""
-        now = self._history.setting[:2]
-        fits = {n: p for n, p in self._presets.items() if p.apply(self._history.start) == now}
-        return fits.get(self._wanted, next(iter(fits.values()), None))
-
-    def want(self, label: str) -> None:
-        """Name this preset as long as its parameters are in force."""
-        self._wanted = label
-        self.show()
-
-    def _take_choice(self) -> None:
-        preset = self._presets.get(self._choice.read())
-        if preset is None:
-            self.show()  # "By hand" is what the list says, nothing to choose.
-            return
-        self._wanted = preset.label
-        self._choose(*preset.apply(self._history.start))
 
 
 class KeepPanel:
@@ -388,32 +347,20 @@ class KeepPanel:
                 (_PRESET, _RUN),
                 hint="A preset is for every scene of this server; a run keeps motion and metrics",
             )
-            self._delete: Any = gui.add_button("Delete preset", color="gray", visible=False)
             self._progress: Any = gui.add_html("", visible=False)
-            self._problems: Any = gui.add_html("", visible=False)
+            self._own = OwnKept(
+                gui,
+                guard,
+                choice,
+                store=storage.presets,
+                what="preset",
+                tell=lambda: storage.tell("delete a preset"),
+            )
         buttons.on_click(guard(self._press))
-        self._delete.on_click(guard(self._remove))
-        self._unsubscribe = self._store.subscribe(self.refresh)
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Show the users' presets as they are now."""
-        self._choice.refresh()
-        problems = self._choice.problems
-        lines = [f"⚠ {html.escape(problem)}" for problem in problems[:_PROBLEMS]]
-        if len(problems) > _PROBLEMS:
-            lines.append(f"… and {len(problems) - _PROBLEMS} more")
-        write_small(self._problems, "<br/>".join(lines))
-        self.show()
 
     def show(self) -> None:
         """Offer to delete the preset in force, if it is a user's."""
-        chosen = self._choice.chosen
-        is_own = chosen is not None and chosen.is_own
-        if chosen is not None and is_own:
-            self._delete.label = f"Delete preset “{chosen.name}”"
-        if self._delete.visible != is_own:
-            self._delete.visible = is_own
+        self._own.show()
 
     def show_run(self, run: SavedRun) -> None:
         """Write how far a saved run is, with a link to it."""
@@ -426,7 +373,7 @@ class KeepPanel:
     def close(self) -> None:
         """Stop listening."""
         self._closed.set()
-        self._unsubscribe()
+        self._own.close()
 
     def _press(self, event: Any) -> None:
         if event.target.value == _RUN:
@@ -465,20 +412,5 @@ class KeepPanel:
         self.show()
         kept = preset.name
         if history.setting.edits:
-            kept += ": the parameters. Edits are of this object alone; save them as a run."
+            kept += ": the parameters. Edits are kept in the tab Edit, or with a run."
         notify(event.client, "Preset saved", kept, color="blue")
-
-    def _remove(self, event: Any) -> None:
-        chosen = self._choice.chosen
-        if chosen is None or not chosen.is_own:
-            raise UsageError("Choose one of your own presets first; the program's stay.")
-        self._store.delete(chosen.name)
-        self._storage.tell("delete a preset")
-        notify(event.client, "Preset deleted", chosen.name, color="blue")
-
-
-def write_small(place: Any, content: str) -> None:
-    """Write small print; without content it takes no room."""
-    style = "font-size:0.8em;line-height:1.4;padding:0 0.5em"
-    place.content = f"<div style='{style}'>{content}</div>"
-    place.visible = bool(content)

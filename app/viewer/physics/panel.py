@@ -257,6 +257,7 @@ class PhysicsPanel:
         self._gestures = Gestures(server.gui)
         self._step_texts: dict[tuple[Setting, Setting], str] = {}
         self._rollouts = rollouts
+        self._listener: Callable[[], None] = lambda: None
         self._is_held = False
         self._changed: dict[str, tuple[str, ...]] = {}
         self._is_metric = content.is_metric
@@ -323,6 +324,26 @@ class PhysicsPanel:
             UsageError: If there are too many edits.
         """
         self._change(lambda: self.history.edit(_with(self.history.setting.edits, edits)))
+
+    def put_edits(self, edits: Edits, title: str) -> None:
+        """Have other edits in place of all in force, as one step.
+
+        Args:
+            edits: What is to be done to single springs and nodes, and nothing else.
+            title: What the list of steps calls it.
+        """
+
+        def put() -> Setting:
+            before = self.history.setting
+            after = self.history.edit(edits)
+            self._step_texts[before, after] = title
+            return after
+
+        self._change(put)
+
+    def follow(self, listener: Callable[[], None]) -> None:
+        """Call a function whenever another setting is in force; it must not change one."""
+        self._listener = listener
 
     def remove(self) -> None:
         """Take the panel away."""
@@ -477,6 +498,7 @@ class PhysicsPanel:
         self._presets.show()
         if self.keep is not None:
             self.keep.show()
+        self._listener()
         self._show_changes()
         self._show_steps()
 

@@ -19,7 +19,8 @@ from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.session_state import Pose
 from app.viewer.live.client import STARTING, SimulationClient
 from app.viewer.live.drive import HandOrder
-from app.viewer.physics.keep_panel import SavedRun, saved_html, write_small
+from app.viewer.physics.keep_panel import SavedRun, saved_html
+from app.viewer.physics.kept_choice import write_small
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
 from app.viewer.steer.key_channel import KeyChannel, Press, velocity_of, view_axes

@@ -6,6 +6,7 @@ import viser
 from viewer_client import ViewerClient
 from viewer_world import FakeSettings, FolderCatalog, Recording, make_run, make_sequence
 
+from app.viewer.physics.edit_presets import EditPresetStore
 from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
 from app.viewer.sessions import Sessions
@@ -56,7 +57,8 @@ def storage(
     """Where users keep presets and runs."""
     saver = RunSaver(catalog, tmp_path / "runs", begun.append)
     presets = PresetStore(tmp_path / "presets")
-    return UserStorage(presets, saver, lambda *told: noted.append(told))
+    edit_presets = EditPresetStore(presets.folder)
+    return UserStorage(presets, edit_presets, saver, lambda *told: noted.append(told))
 
 
 @pytest.fixture
