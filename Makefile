@@ -37,14 +37,15 @@ fmt: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# One of the two processes has all browsers: beside each other they hold each other up.
+# Three processes keep two processors busy: one has all browsers, which wait for pictures and answers
+# as often as they compute, and beside each other hold each other up.
 test: install browser
-	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 3 --no-loadscope-reorder
 
 # The same tests, with every line counted that they go through: a fifth slower.
 coverage: install browser
 	rm -f .coverage .coverage.*
-	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder --cov --cov-report=term
+	$(BIN)/python -m pytest -n 3 --no-loadscope-reorder --cov --cov-report=term
 
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install

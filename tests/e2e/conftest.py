@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from PIL import Image
@@ -38,6 +39,9 @@ BELOW = "/lab/physhandi"
 START = "from app.cli import main; main()"
 _CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist", *LESS_DRAWING]
 _VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
+_STILL: Literal["reduce"] = "reduce"
+"""What moves for decoration alone is drawn sixty times a second, by software; a test that is about
+motion asks for it."""
 _PICTURES = "PHYSHANDI_PICTURES"
 """Names the folder of the README's pictures, which are made anew if it is set (`make pictures`)."""
 _SETTLE_MS = 2_000
@@ -198,7 +202,7 @@ def _close(context: BrowserContext) -> None:
 @pytest.fixture
 def context(browser: Browser) -> Iterator[BrowserContext]:
     """A browser for one test; its pages may not complain of anything."""
-    context = browser.new_context(viewport=_VIEWPORT)
+    context = browser.new_context(viewport=_VIEWPORT, reduced_motion=_STILL)
     complaints = _complaints_in(context)
     yield context
     _close(context)
@@ -239,12 +243,13 @@ def shared_scene(
     """
     opened = _opened_scene
     if opened.scene is None:
-        page = browser.new_context(viewport=_VIEWPORT).new_page()
+        page = browser.new_context(viewport=_VIEWPORT, reduced_motion=_STILL).new_page()
         opened.complaints = _complaints_in(page.context)
         page.goto(_shared_server.url)
         scene = ScenePage.opened_from(page)
         scene.pause()
         opened.scene = scene
+    opened.scene.rest(on=False)
     failed = request.session.testsfailed
     opened.scene.page.set_viewport_size(_VIEWPORT)
     for tab in ("Physics", "Springs"):
@@ -254,6 +259,8 @@ def shared_scene(
     opened.complaints.clear()
     if complaints or request.session.testsfailed > failed:
         opened.close()
+    else:
+        opened.scene.rest(on=True)
     assert complaints == []
 
 

@@ -32,7 +32,7 @@ def page(browser: Browser, served) -> Iterator[Page]:
     torn = served.data_dir / "runs/torn"
     shutil.copytree(BUNDLED_RUN, torn)
     truncated(f"attempts/1/out/{ROLLOUT}")(torn)
-    context = browser.new_context()
+    context = browser.new_context(reduced_motion="reduce")
     context.set_default_timeout(TIMEOUT_MS)
     defects: list[str] = []
     context.on("weberror", lambda error: defects.append(str(error.error)))

@@ -93,6 +93,7 @@ def test_runs_are_filtered_sorted_chosen_and_compared(home: Page, base: str, pic
 def test_a_picture_appears_when_it_is_made_and_moves_while_it_is_pointed_at(
     home: Page, base: str
 ) -> None:
+    home.emulate_media(reduced_motion="no-preference")
     home.goto(f"{base}/sequences")
     card = home.locator("article[data-sequence=towel_fold]")
     moving = card.locator("img.moving")
@@ -163,7 +164,6 @@ def test_no_page_keeps_anybody_out(home: Page, base: str) -> None:
         "/system",
         "/runs/copy0/view",
     )
-    home.emulate_media(reduced_motion="reduce")  # Or colors are looked at while they change.
     for path in paths:
         home.emulate_media(color_scheme="light")
         home.goto(f"{base}{path}")

@@ -132,7 +132,8 @@ def test_a_replay_plays_without_a_session_and_from_one_file(
     home.goto(f"{base}/runs/towel_fold_quick")
     home.get_by_role("button", name="Share").click()
     address = home.locator("#shares a").get_attribute("href")
-    stranger = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    window = {"width": 1280, "height": 800}
+    stranger = browser.new_context(viewport=window, reduced_motion="reduce").new_page()
     stranger.set_default_timeout(TIMEOUT_MS)
     stranger.add_init_script(FEWER_PICTURES)
     complaints: list[str] = []

@@ -33,6 +33,8 @@ def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
 
 def shot_of(scene: ScenePage) -> np.ndarray:
     """What the scene shows left of the panel."""
+    # What arrives while a picture is drawn may be missing in it until something asks for another.
+    scene.panel.locator("body").evaluate("() => window.__viserMutable?.requestRender()")
     scene.page.wait_for_timeout(600)
     shot = scene.page.screenshot(clip={"x": 330, "y": 60, "width": 600, "height": 700})
     return cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)

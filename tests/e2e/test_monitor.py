@@ -41,6 +41,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[QueueWorl
 def page(world: QueueWorld, context: BrowserContext) -> Iterator[Page]:
     with serving(world) as port:
         page = context.new_page()
+        page.emulate_media(reduced_motion="no-preference")  # So that previews play.
         page.goto(f"http://127.0.0.1:{port}/system?token={world.token}")
         yield page
         page.goto("about:blank")

@@ -128,7 +128,6 @@ def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
 def test_no_tab_keeps_anybody_out(shared_scene):
     """Not by names that are missing, nor by colors that cannot be told apart."""
     scene, page = shared_scene, shared_scene.page
-    page.emulate_media(reduced_motion="reduce")  # Or colors are looked at while they change.
     frame = next(frame for frame in page.frames if "/viewer/" in frame.url)
     for scheme in ("dark", "light"):
         page.emulate_media(color_scheme=scheme)
@@ -136,7 +135,7 @@ def test_no_tab_keeps_anybody_out(shared_scene):
         for tab in ("Physics", "Look", "Play", "Edit", "Export"):
             scene.tab(tab)
             assert violations(frame) == [], f"{tab}, {scheme}"
-    page.emulate_media(color_scheme="null", reduced_motion="null")
+    page.emulate_media(color_scheme="null")
 
 
 _STEERED = """() => {
