@@ -97,6 +97,9 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) ->
 
 def colored(page: Page, color: str) -> np.ndarray:
     """Find the columns of the scene's picture that have a side's color."""
+    # What arrives while a picture is drawn may be missing in it until something asks for another.
+    scene = page.frame_locator("#scene").locator("body")
+    scene.evaluate("() => window.__viserMutable?.requestRender()")
     shot = page.locator("#scene").screenshot()
     image = cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
