@@ -3,7 +3,8 @@
 /* Part of viser's page wherever we show it, live, as a replay or in a file: what it lacks for our scenes.
 
    Meshes of viser have one color. Where more bytes follow that, they are the colors of the vertices.
-   Until the first frame is drawn, the page is covered: its parts come one by one. */
+   Until the first frame is drawn, the page is covered: its parts come one by one. Below that cover viser
+   fades its canvas in, in five frames, and stops halfway, for good, where our light arrives meanwhile. */
 
 {
   const LONGEST_MS = 10000;
@@ -109,6 +110,10 @@
       setTimeout(() => cover.remove(), 250);
     }));
   }
+
+  const sheet = new CSSStyleSheet();
+  sheet.replaceSync("canvas { opacity: 1 !important; }");
+  document.adoptedStyleSheets.push(sheet);
 
   setTimeout(uncover, LONGEST_MS);
   follow();

@@ -119,6 +119,10 @@ def test_a_scene_opens_plays_and_saves_what_it_shows(home, fitted, tmp_path, pic
     assert low < 0.5
     assert high > 2.0
     expect(inside.get_by_text("Opening the scene")).to_have_count(0)
+    # viser fades its canvas in and may stop halfway; everything would stay pale.
+    canvas = inside.locator("canvas[data-engine]")
+    canvas.evaluate("canvas => (canvas.style.opacity = 0.4)")
+    expect(canvas).to_have_css("opacity", "1")
     if home.locator("[data-first-hint]").is_visible():  # A picture was taken without it.
         home.get_by_role("button", name="Got it").click()
     home.reload(wait_until="load")
