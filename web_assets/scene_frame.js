@@ -11,6 +11,7 @@
   const LEAST_ASPECT = 1;
   const SHOWN = ["MeshMessage", "PointCloudMessage", "LineSegmentsMessage", "CameraFrustumMessage", "BatchedMeshesMessage", "GaussianSplatsMessage"];
   const LINEAR = Float32Array.from({ length: 256 }, (_, value) => (value < 10.32 ? value / 3294.6 : ((value / 255 + 0.055) / 1.055) ** 2.4));
+  const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
   const given = new WeakMap();
   const isRecording = Boolean(window.__VISER_EMBED_CONFIG__) || new URLSearchParams(location.search).has("playbackPath");
 
@@ -70,12 +71,26 @@
     viewer.requestRender();
   }
 
+  /* Without a graphics card the three maps of shadows are half of what a picture costs. */
+  let isSlow = null;
+
+  function dropShadows(viewer) {
+    if (!viewer.canvas || !viewer.scene) return;
+    if (isSlow === null) {
+      const context = viewer.canvas.getContext("webgl2");
+      const named = context?.getExtension("WEBGL_debug_renderer_info");
+      isSlow = Boolean(named) && SOFTWARE.test(context.getParameter(named.UNMASKED_RENDERER_WEBGL));
+    }
+    if (isSlow) for (const part of viewer.scene.children) if (part.isLight) part.castShadow = false;
+  }
+
   const painted = new Set();
 
   function follow() {
     requestAnimationFrame(follow);
     const [tree, viewer] = [window.__viserSceneTree, window.__viserMutable];
     if (!tree || !viewer) return;
+    dropShadows(viewer);
     if (isRecording) keepSides(viewer);
     let [isChanged, hasContent] = [false, false];
     for (const [name, node] of Object.entries(tree.getState())) {

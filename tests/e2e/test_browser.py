@@ -69,6 +69,11 @@ _COLORS_OF_VERTICES = """() => {
 """Least and largest share of the mesh's own color that a vertex has (1 is that color itself), and
 how many shares there are."""
 
+_LIGHTS_AND_SHADOWS = """() => {
+  const found = __viserMutable.scene.children.filter((part) => part.isLight);
+  return { lights: found.length, shadows: found.filter((light) => light.castShadow).length };
+}"""
+
 
 def test_the_printed_address_shows_sequences_and_finished_runs(home, fitted, picture):
     expect(home.locator("[data-sequence=towel_fold] h3")).to_contain_text("towel_fold")
@@ -123,6 +128,10 @@ def test_a_scene_opens_plays_and_saves_what_it_shows(home, fitted, tmp_path, pic
     canvas = inside.locator("canvas[data-engine]")
     canvas.evaluate("canvas => (canvas.style.opacity = 0.4)")
     expect(canvas).to_have_css("opacity", "1")
+    # This browser draws without a graphics card, for which shadows are too much.
+    lights = inside.evaluate(_LIGHTS_AND_SHADOWS)
+    assert lights["lights"] >= 4
+    assert lights["shadows"] == 0
     if home.locator("[data-first-hint]").is_visible():  # A picture was taken without it.
         home.get_by_role("button", name="Got it").click()
     home.reload(wait_until="load")
