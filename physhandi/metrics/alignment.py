@@ -90,33 +90,48 @@ def carried_points(
         is_visible = np.ones((frame_count, carrier_count), dtype=bool)
     moved = np.full((frame_count, len(point), 3), np.nan)
     least = min(LEAST_CARRIERS, carrier_count)
+    held: _Held | None = None
     for frame in range(frame_count):
         usable = np.flatnonzero(is_visible[0] & is_visible[frame])
         if not len(point) or len(usable) < max(least, 1):
             continue
-        moved[frame] = _carried(point, carrier[0, usable], carrier[frame, usable], least, reach)
+        # Nodes are known in all frames: what carries a point is looked up once.
+        if held is None or not np.array_equal(held.usable, usable):
+            held = _Held(point, carrier[0], usable, least, reach)
+        moved[frame] = held.moved(carrier[frame])
     return moved
 
 
-def _carried(
-    point: Float[ndarray, "point 3"],
-    start: Float[ndarray, "carrier 3"],
-    now: Float[ndarray, "carrier 3"],
-    least: int,
-    reach: float,
-) -> Float[ndarray, "point 3"]:
-    tree: Any = KDTree(start)
-    count = min(CARRIERS, len(start))
-    distance, near = tree.query(point, k=count)
-    distance, near = np.reshape(distance, (-1, count)), np.reshape(near, (-1, count))
-    weight = (distance <= reach).astype(np.float64)
-    is_known = weight.sum(axis=1) >= least
-    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
-    start_mean, now_mean = (np.einsum("pc,pci->pi", weight, x[near]) for x in (start, now))
-    source, target = start[near] - start_mean[:, None], now[near] - now_mean[:, None]
-    rotation = best_rotations(np.einsum("pc,pci,pcj->pij", weight, target, source))
-    moved = np.einsum("pij,pj->pi", rotation, point - start_mean) + now_mean
-    return np.where(is_known[:, None], moved, np.nan)
+class _Held:
+    """Points with what carries them, as long as the same carriers are known."""
+
+    def __init__(
+        self, point: ndarray, start: ndarray, usable: ndarray, least: int, reach: float
+    ) -> None:
+        self.usable = usable
+        start = start[usable]
+        tree: Any = KDTree(start)
+        count = min(CARRIERS, len(start))
+        distance, near = tree.query(point, k=count)
+        distance, self._near = (np.reshape(x, (-1, count)) for x in (distance, near))
+        weight = (distance <= reach).astype(np.float64)
+        self._is_known = weight.sum(axis=1) >= least
+        self._weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
+        mean, self._source = self._about_mean(start)
+        self._offset = point - mean
+
+    def _about_mean(self, carrier: ndarray) -> tuple[ndarray, ndarray]:
+        """Mean of each point's carriers, and where they are from there."""
+        near = carrier[self._near]
+        mean = np.einsum("pc,pci->pi", self._weight, near)
+        return mean, near - mean[:, None]
+
+    def moved(self, carrier: ndarray) -> Float[ndarray, "point 3"]:
+        """Where carriers of another frame take the points."""
+        mean, target = self._about_mean(carrier[self.usable])
+        turn = best_rotations(np.einsum("pc,pci,pcj->pij", self._weight, target, self._source))
+        found = np.einsum("pij,pj->pi", turn, self._offset) + mean
+        return np.where(self._is_known[:, None], found, np.nan)
 
 
 def _smallest_rotation(source: ndarray, target: ndarray) -> Float[ndarray, "3 3"]:
