@@ -213,7 +213,8 @@ KEYS: tuple[KeyGroup, ...] = (
             ),
             Key(
                 shown=("click",),
-                about="while steering: hold a point of the object and move that",
+                about="while steering: bend the finger whose dot is clicked, or hold a point of "
+                "the object and move that",
             ),
             Key(
                 shown=("space",),

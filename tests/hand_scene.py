@@ -30,6 +30,21 @@ def looking_at_hand(azimuth: float, distance: float = 0.6) -> PinholeCamera:
     return PinholeCamera(K=K, T_world_camera=pose, width=SIZE, height=SIZE, distortion=distortion)
 
 
+def flat_and_bent(side: HandSide) -> HandMotion:
+    """A hand that is flat in frame 0, and turned and bent a little everywhere in frame 1."""
+    mirror = np.array([1.0, 1.0, 1.0] if side == "right" else [1.0, -1.0, -1.0])
+    rng = np.random.default_rng(4)
+    bent = np.zeros((2, 15, 3))
+    bent[1] = 0.1 * rng.normal(size=(15, 3)) - [0.3, 0.0, 0.0]
+    return HandMotion(
+        side=side,
+        shape=np.zeros(10),
+        articulation=bent * mirror,
+        wrist_rotation=np.array([[0.0, 0.0, 0.0], [0.2, -0.4, 0.1]]) * mirror,
+        wrist_translation=np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]]) * [mirror[1], 1.0, 1.0],
+    )
+
+
 def grasping(
     side: HandSide = "right", frames: int = 16, scale: float = 1.0, model: HandKind = "open"
 ) -> HandMotion:

@@ -447,7 +447,10 @@ class Session(SceneServer):
                     rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
                 )
             elif self._steer is not None and rollout is not None:
-                self._inspector.rest(rollout, rollout_frame, self._steer.grab)
+                steer = self._steer
+                self._inspector.rest(
+                    rollout, rollout_frame, steer.grab, steer.dots, steer.choose_dot
+                )
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
         self._server.flush()  # viser would wait for more, up to 17 ms.

@@ -21,7 +21,13 @@ from physhandi.data.sequence_meta import SequenceMeta, Side
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.fitting import artefacts
 from physhandi.fitting.stored_take import StoredTake
-from physhandi.hand.curl import BONE_OF_KEYPOINT, blended, curl_motion, curled_rotations
+from physhandi.hand.curl import (
+    BONE_OF_KEYPOINT,
+    blended,
+    curl_motion,
+    curled_rotations,
+    weight_of_joints,
+)
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import Progress
@@ -145,7 +151,7 @@ def with_points(
 
 
 def store_hands(source: RunFolder, stored: StoredTake, name: str, attempt: Attempt) -> None:
-    """Store the steered hands: surfaces, joints, skins and motions, moved as rigid bodies.
+    """Store the steered hands: surfaces, joints, skins and motions, as they were moved.
 
     Args:
         source: Run whose hands were steered.
@@ -170,9 +176,9 @@ def _store_hand(
     was, now = SequenceFiles(stored.sequence), SequenceFiles(name)
     pose = stored.take.pose[:, number]
     skin = source.tensors(was.hand_skin(side)) if source.has(was.hand_skin(side)) else None
-    bones, rotation = None, None
-    if skin is not None and hand.curls is not None and pose[:, 6].any():
-        rotation = curled_rotations(skin, side, stored.frame, pose[:, 6])
+    bones, rotation, bend = None, None, pose[:, 7:]
+    if skin is not None and hand.curls is not None and pose[:, 6:].any():
+        rotation = curled_rotations(skin, side, stored.frame, pose[:, 6], bend)
         # The last one tells where points are without any curl.
         bones = curl_motion(skin, side, stored.frame, np.append(pose[:, 6], 0.0))
 
@@ -184,6 +190,11 @@ def _store_hand(
         if bones is not None:
             curled = blended(bones, bone, weight, point)
             points += curled[:-1] - curled[-1]
+        if hand.fingers is not None and bend.any():
+            fingers = replace(hand.fingers, weight=weight_of_joints(bone, weight))
+            points = np.stack(
+                [fingers.bent(*its) for its in zip(points, pose[:, 6], bend, strict=True)]
+            )
         moved = np.stack([hand.moved(*its) for its in zip(points, pose, strict=True)])
         attempt.save_array(new, moved.astype(np.float32))
 
@@ -216,7 +227,7 @@ def _moved_skin(
     pose: ndarray,
     curled: Float[ndarray, "frame bone 4"] | None,
 ) -> dict[str, ndarray]:
-    """Let the wrist move; other bones stay as they are in a frame, unless they are curled."""
+    """Let the wrist move; other bones stay as they are in a frame, unless they are bent."""
     translation = np.repeat(_in_frame(skin["translation"], frame)[None], len(pose), axis=0)
     rotation = np.repeat(_in_frame(skin["rotation"], frame)[None], len(pose), axis=0)
     if curled is not None:
@@ -236,7 +247,7 @@ def _moved_motion(
     pose: ndarray,
     curled: Float[ndarray, "frame bone 4"] | None,
 ) -> HandMotion:
-    """Let the wrist of a hand move, which keeps the articulation of a frame unless it is curled."""
+    """Let the wrist of a hand move, which keeps the articulation of a frame unless it is bent."""
     turn, place = (
         _in_frame(value, frame) for value in (motion.wrist_rotation, motion.wrist_translation)
     )

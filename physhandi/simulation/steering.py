@@ -1,9 +1,9 @@
 """An object whose hands somebody steers: frame by frame, from any state on, and as takes of it.
 
-A steered hand keeps the shape that it had and moves as a rigid body; what it holds at the start of
-a take it holds throughout. A hand that lets go or grips anew, and a point of the object that is
-held by itself, begin another take. A take is the poses of its hands over the frames beside the
-state that it begins in, so that simulating it again gives the same bits.
+A steered hand moves about its wrist and bends its fingers, and else keeps the shape that it had;
+what it holds at the start of a take it holds throughout. A hand that lets go or grips anew, and a
+point of the object that is held by itself, begin another take. A take is the poses of its hands
+over the frames beside the state that it begins in, so that simulating it again gives the same bits.
 """
 
 import math
@@ -18,8 +18,10 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from physhandi.errors import UsageError
 from physhandi.quaternions import without_jumps
 from physhandi.simulation.contact_intervals import always
+from physhandi.simulation.fingers import BENDS, CURLS, Fingers, curled
 from physhandi.simulation.forces import virtual_spring_forces
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -32,13 +34,16 @@ _ARRAYS = {"control", "hand_of_control", "hand_name", "wrist", "pose", "is_edite
 """Arrays of a stored take besides those of its model and its start."""
 _SHAPES = "curls_"
 """Prefix of the arrays that hold `SteeredHand.curls`, by the hand's number."""
+_FINGERS = "fingers_"
+"""Prefix of the arrays that hold `SteeredHand.fingers`: the hand's number and their own name."""
 
 
-POSE = 7
+POSE = 7 + BENDS
 """Numbers of a hand's pose: how far its wrist has moved [m], the rotation vector about it [rad],
-and how far its fingers are closed: 1 for a fist, 0 for as they were, -1 for open."""
-CURLS = np.linspace(-1.0, 1.0, 17)
-"""Curls of the fingers for which the shape of a hand is known; in between it is interpolated."""
+how far its fingers are closed (1 for a fist, 0 for as they were, -1 for open), and how far each of
+them is bent on top of that [rad]; see `Fingers`."""
+_WITHOUT_BENDS = 7
+"""Numbers of a pose in takes that were stored before fingers could be bent one by one."""
 
 
 def turn_on(rotation: Float[ndarray, " 3"], by: Float[ndarray, " 3"]) -> Float[ndarray, " 3"]:
@@ -69,27 +74,26 @@ def nearest_surface(
     return np.argmin(distance, axis=0)
 
 
-def curled(shapes: Float[ndarray, "curl point 3"], curl: float) -> Float[ndarray, "point 3"]:
-    """Interpolate points of a hand between `CURLS` [m].
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandSurface:
+    """Vertices of a hand in the frame from which it is steered, and how its fingers move them."""
 
-    Args:
-        shapes: The points for each of `CURLS`, or one row for a hand whose fingers do not move [m].
-        curl: How far the fingers are closed.
-    """
-    if len(shapes) == 1:
-        return shapes[0]
-    place = float(np.interp(curl, CURLS, np.arange(len(CURLS))))
-    low = min(int(place), len(CURLS) - 2)
-    share = place - low
-    # One of the two alone where the curl is a sample, so that a hand that is not curled keeps bits.
-    if share in {0.0, 1.0}:
-        return shapes[low + int(share)]
-    return (1.0 - share) * shapes[low] + share * shapes[low + 1]
+    shapes: Float[ndarray, "curl vertex 3"]
+    """The vertices for each of `CURLS`, or one row for a hand whose fingers do not move [m]."""
+    fingers: Fingers | None = None
+    """Its fingers, whose points are the vertices; None if they do not bend one by one."""
+
+    def at(self, pose: Float[ndarray, " pose"]) -> Float[ndarray, "vertex 3"]:
+        """Give the vertices in a pose of the fingers, the wrist being in that of zero [m]."""
+        point = curled(self.shapes, pose[6])
+        if self.fingers is None or not pose[7:].any():
+            return point
+        return self.fingers.bent(point, pose[6], pose[7:])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SteeredHand:
-    """Control nodes that move as one rigid body."""
+    """Control nodes that move with a wrist, and with the fingers of a hand that has bones."""
 
     name: str
     """What it is called: ``right``, ``left``, or ``controls`` where there are no hands."""
@@ -100,12 +104,14 @@ class SteeredHand:
     curls: Float32[ndarray, "curl own 3"] | None = None
     """Its control nodes for each of `CURLS`, the rest of the pose zero [m]; None if its fingers do
     not move."""
+    fingers: Fingers | None = None
+    """Its fingers, whose points are its control nodes; None if they do not bend one by one."""
 
     @classmethod
     def of_surface(
         cls,
         name: str,
-        shapes: Float[ndarray, "curl vertex 3"],
+        hand: HandSurface,
         *,
         control: Int[ndarray, " own"],
         recorded: Float[ndarray, "all 3"],
@@ -116,34 +122,35 @@ class SteeredHand:
 
         Args:
             name: What the hand is called.
-            shapes: Vertices for each of `CURLS`, or one row if the fingers do not move [m].
+            hand: The surface.
             control: Numbers of its control nodes.
             recorded: Where all control nodes are on the surface [m].
             place: Where they are simulated [m].
             wrist: Point about which it turns [m]; the middle of the surface if left out.
         """
-        surface, curls = curled(shapes, 0.0), None
+        shapes, surface, curls, fingers = hand.shapes, curled(hand.shapes, 0.0), None, None
         if len(shapes) > 1:
             nearest = np.asarray(KDTree(surface).query(recorded[control])[1])
             curls = place[control] + (shapes[:, nearest] - surface[nearest])
             curls = curls.astype(np.float32)
+            fingers = None if hand.fingers is None else hand.fingers.of_points(nearest)
         middle = surface.mean(axis=0) if wrist is None else wrist
-        return cls(name=name, control=control, wrist=middle, curls=curls)
+        return cls(name=name, control=control, wrist=middle, curls=curls, fingers=fingers)
 
     def moved(
-        self, point: Float[ndarray, "point 3"], pose: Float[ndarray, " 7"]
+        self, point: Float[ndarray, "point 3"], pose: Float[ndarray, " pose"]
     ) -> Float[ndarray, "point 3"]:
         """Move points with the wrist of the hand.
 
         Args:
-            point: Points in the hand's pose of zero, but for its curl [m].
+            point: Points in the hand's pose of zero, but for its fingers [m].
             pose: Its pose.
         """
         turn = Rotation.from_rotvec(pose[3:6]).as_matrix()
         return (np.asarray(point, np.float64) - self.wrist) @ turn.T + (self.wrist + pose[:3])
 
     def moved_control(
-        self, control: Float32[ndarray, "control 3"], pose: Float[ndarray, " 7"]
+        self, control: Float32[ndarray, "control 3"], pose: Float[ndarray, " pose"]
     ) -> Float[ndarray, "own 3"]:
         """Give its control nodes.
 
@@ -151,8 +158,42 @@ class SteeredHand:
             control: All control nodes where all poses are zero [m].
             pose: Its pose.
         """
-        own = control[self.control]
-        return self.moved(own if self.curls is None else curled(self.curls, pose[6]), pose)
+        shapes = control[self.control][None] if self.curls is None else self.curls
+        return self.moved(HandSurface(shapes=shapes, fingers=self.fingers).at(pose), pose)
+
+    def tip(self, finger: int, pose: Float[ndarray, " pose"]) -> Float[ndarray, " 3"]:
+        """Tell where the tip of one of its `FINGERS` is in a pose [m].
+
+        Raises:
+            UsageError: If its fingers do not bend.
+        """
+        tips = self._bending().tips(pose[6], pose[7:])
+        return self.moved(tips[finger][None], pose)[0]
+
+    def follow(
+        self, finger: int, target: Float[ndarray, " 3"], pose: Float[ndarray, " pose"]
+    ) -> Float[ndarray, " bend"]:
+        """Tell how its fingers are bent when the tip of one follows a target; its wrist stays.
+
+        Args:
+            finger: Which of `FINGERS`.
+            target: Where the tip shall be [m].
+            pose: The hand's pose now.
+
+        Raises:
+            UsageError: If its fingers do not bend, or the target is not finite.
+        """
+        place = np.asarray(target, np.float64)
+        if not np.isfinite(place).all():
+            raise UsageError("A fingertip needs a place of finite numbers.")
+        turn = Rotation.from_rotvec(pose[3:6]).as_matrix()
+        still = (place - self.wrist - pose[:3]) @ turn + self.wrist
+        return self._bending().follow(finger, still, pose[6], pose[7:])
+
+    def _bending(self) -> Fingers:
+        if self.fingers is None:
+            raise UsageError(f"{self.name} has no fingers that bend one by one.")
+        return self.fingers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -170,7 +211,7 @@ class Take:
     hands: tuple[SteeredHand, ...]
     """The hands; control nodes of none of them, such as those that nodes are pinned to, stay where
     they are."""
-    pose: Float[ndarray, "frame hand 7"] = field(default_factory=lambda: np.zeros((1, 1, POSE)))
+    pose: Float[ndarray, "frame hand pose"] = field(default_factory=lambda: np.zeros((1, 1, POSE)))
     """Poses of the hands (`POSE`); where they are zero, control nodes are as in `control`."""
     is_edited: bool = False
     """Whether single springs or nodes were edited, so that its springs cannot be laid anew."""
@@ -199,6 +240,11 @@ class Take:
                     f"curls of {hand.name} has shape {hand.curls.shape} or values that are not "
                     f"finite; expected {expected}."
                 )
+            if hand.fingers is not None and len(hand.fingers.weight) != len(hand.control):
+                raise ValueError(
+                    f"fingers of {hand.name} move {len(hand.fingers.weight)} points; expected one "
+                    f"for each of its {len(hand.control)} control nodes."
+                )
         number = np.concatenate([hand.control for hand in self.hands])
         moving = self.model.control_count - self.model.pin_count
         if len(np.unique(number)) != len(number) or np.any((number < 0) | (number >= moving)):
@@ -209,7 +255,7 @@ class Take:
         """Number of frames."""
         return len(self.pose)
 
-    def control_at(self, pose: Float[ndarray, "hand 7"]) -> Float32[ndarray, "control 3"]:
+    def control_at(self, pose: Float[ndarray, "hand pose"]) -> Float32[ndarray, "control 3"]:
         """Give the control nodes while the hands have these poses [m]."""
         moved = np.array(self.control, np.float32)
         for hand, its in zip(self.hands, pose, strict=True):
@@ -220,7 +266,7 @@ class Take:
         """Give the control nodes of all frames [m]."""
         return np.stack([self.control_at(pose) for pose in self.pose])
 
-    def depth_below_ground(self, hand: int, pose: Float[ndarray, " 7"]) -> float:
+    def depth_below_ground(self, hand: int, pose: Float[ndarray, " pose"]) -> float:
         """Tell how much too low a hand would be.
 
         Args:
@@ -255,7 +301,7 @@ class Take:
         """Whether a virtual spring joins a hand to the object."""
         return bool(self._springs_of(hand).any())
 
-    def let_go(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 7"]) -> "Take":
+    def let_go(self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]) -> "Take":
         """Begin another take, in which a hand holds nothing.
 
         Args:
@@ -265,7 +311,7 @@ class Take:
         """
         return self._rejoined(~self._springs_of(hand), state, pose)
 
-    def grip(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 7"]) -> "Take":
+    def grip(self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]) -> "Take":
         """Begin another take, in which a hand holds what is near its control nodes.
 
         The arguments are those of `let_go`. Nodes are near that are nearer than
@@ -287,7 +333,7 @@ class Take:
         return self._rejoined(~self._springs_of(hand), state, pose, (springs, length))
 
     def hold_point(
-        self, node: int, state: NodeState, pose: Float[ndarray, "hand 7"], name: str
+        self, node: int, state: NodeState, pose: Float[ndarray, "hand pose"], name: str
     ) -> "Take":
         """Begin another take, in which the object is held at one more point, by a hand of its own.
 
@@ -331,7 +377,9 @@ class Take:
         held = np.concatenate([pose, np.zeros((1, POSE))])
         return more._rejoined(every, state, held, (springs, length))
 
-    def without_point(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 7"]) -> "Take":
+    def without_point(
+        self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]
+    ) -> "Take":
         """Begin another take, in which a point is held no more; the arguments are `let_go`'s."""
         free = self.let_go(hand, state, pose)
         gone, model = self.hands[hand].control, free.model
@@ -361,7 +409,7 @@ class Take:
         self,
         kept: Bool[ndarray, " spring"],
         state: NodeState,
-        pose: Float[ndarray, "hand 7"],
+        pose: Float[ndarray, "hand pose"],
         joined: tuple[Int[ndarray, "new 2"], Float[ndarray, " new"]] | None = None,
     ) -> "Take":
         """Begin another take with other virtual springs, and with more substeps if they need it.
@@ -428,9 +476,9 @@ class Take:
         before = 2.0 * values[:1] - values[:0:-1]
         both: ndarray = np.concatenate([before, values])
         smooth = gaussian_filter1d(both, width, axis=0, mode="nearest")[count - 1 :]
-        rotation = Rotation.from_quat(smooth[..., 4:].reshape(-1, 4)).as_rotvec()
+        rotation = Rotation.from_quat(smooth[..., -4:].reshape(-1, 4)).as_rotvec()
         rotation = rotation.reshape(count, hands, 3)
-        pose = np.concatenate([smooth[..., :3], rotation, smooth[..., 3:4]], axis=-1)
+        pose = np.concatenate([smooth[..., :3], rotation, smooth[..., 3:-4]], axis=-1)
         pose[0] = self.pose[0]
         return replace(self, pose=pose)
 
@@ -455,6 +503,12 @@ class Take:
                 for number, hand in enumerate(self.hands)
                 if hand.curls is not None
             },
+            **{
+                f"{_FINGERS}{number}_{name}": value
+                for number, hand in enumerate(self.hands)
+                if hand.fingers is not None
+                for name, value in hand.fingers.to_tensors().items()
+            },
         }
 
     @classmethod
@@ -467,7 +521,10 @@ class Take:
             ValueError: If an array is missing, unknown or inconsistent.
         """
         model, start, rest = (_named(tensors, prefix) for prefix in ("model_", "start_", ""))
-        shapes = {name: rest.pop(name) for name in list(rest) if name.startswith(_SHAPES)}
+        shapes, fingers = (
+            {name: rest.pop(name) for name in list(rest) if name.startswith(prefix)}
+            for prefix in (_SHAPES, _FINGERS)
+        )
         if set(rest) != _ARRAYS:
             raise ValueError(
                 f"A take needs the arrays {', '.join(sorted(_ARRAYS))}, a start and a model; "
@@ -485,19 +542,33 @@ class Take:
                 control=np.flatnonzero(owner == number),
                 wrist=wrist[number],
                 curls=shapes.get(f"{_SHAPES}{number}"),
+                fingers=_fingers(fingers, f"{_FINGERS}{number}_"),
             )
             for number, name in enumerate(names)
         )
+        pose = np.asarray(rest["pose"], np.float64)
+        if pose.ndim == 3 and pose.shape[2] == _WITHOUT_BENDS:
+            pose = np.pad(pose, ((0, 0), (0, 0), (0, BENDS)))
         return cls(
             model=springs,
             start=start_from_tensors(start, springs.node_count),
             parameters=parameters,
             control=np.asarray(rest["control"], np.float32),
             hands=hands,
-            pose=np.asarray(rest["pose"], np.float64),
+            pose=pose,
             is_edited=bool(np.any(rest["is_edited"])),
             is_regripped=bool(np.any(rest["is_regripped"])),
         )
+
+
+def _fingers(tensors: Mapping[str, ndarray], prefix: str) -> Fingers | None:
+    """Give the fingers of one hand, if it has any."""
+    own = {
+        name.removeprefix(prefix): value
+        for name, value in tensors.items()
+        if name.startswith(prefix)
+    }
+    return Fingers.from_tensors(own) if own else None
 
 
 def _named(tensors: Mapping[str, ndarray], prefix: str) -> dict[str, ndarray]:
@@ -536,7 +607,7 @@ class SteeredSimulation:
         simulator = self._simulator
         return simulator.position.numpy().copy(), simulator.velocity.numpy().copy()
 
-    def step(self, pose: Float[ndarray, "hand 7"]) -> NodeState:
+    def step(self, pose: Float[ndarray, "hand pose"]) -> NodeState:
         """Simulate a frame while the hands move to their next poses.
 
         Raises:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.content.content import Content
-from app.viewer.inspect.picking import Pick, Ray, Target, pick
+from app.viewer.inspect.picking import Pick, Ray, Target, pick, pick_dot
 from app.viewer.inspect.readings import HISTORIES, HistoryQuantity, Readings, Rows, follow, unit_of
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
@@ -81,6 +81,7 @@ class Inspector:
         self._pick: Pick | None = None
         self._shown: tuple[ObjectRollout | None, int, int] = (None, 0, 0)
         self._grab: Callable[[int], None] | None = None
+        self._dots: tuple[Float[ndarray, "dot 3"], Callable[[int], None]] | None = None
         self._measured: tuple[Any, ...] | None = None
         self._curve: Float[ndarray, " frame"] = np.zeros(0)
         self._refreshed = 0.0
@@ -129,6 +130,8 @@ class Inspector:
         rollout: ObjectRollout,
         rollout_frame: int,
         grab: Callable[[int], None],
+        dots: Float[ndarray, "dot 3"],
+        choose_dot: Callable[[int], None],
     ) -> None:
         """Read nothing until the clock shows a frame again, because hands are being steered.
 
@@ -136,11 +139,14 @@ class Inspector:
             rollout: The object that is drawn.
             rollout_frame: Which of its frames.
             grab: Called with a node of it that is clicked, in the place of reading that.
+            dots: Where there are dots that are clicked first [m].
+            choose_dot: Called with the number of one that is clicked.
         """
         with self._lock:
             if self._pick is not None:
                 self.clear()
             self._shown, self._grab = (rollout, 0, rollout_frame), grab
+            self._dots = dots, choose_dot
 
     def look_at(self, found: Pick | None) -> None:
         """Read a thing, or nothing."""
@@ -180,6 +186,7 @@ class Inspector:
         """
         with self._lock:
             self._shown, self._grab = (rollout, frame, rollout_frame), None
+            self._dots = None
             chosen, readings = self._pick, self._readings
             if chosen is None or readings is None:
                 return
@@ -197,6 +204,19 @@ class Inspector:
             self._draw_history(chosen, rollout, rollout_frame if chosen.kind != "hand" else frame)
 
     def _click(self, event: viser.SceneClickEvent, *, prefers_hand: bool) -> None:
+        camera = event.client.camera
+        ray = Ray(
+            origin=np.asarray(event.ray_origin, dtype=np.float64),
+            direction=np.asarray(event.ray_direction, dtype=np.float64),
+            pixel=float(camera.fov) / max(int(camera.image_height), 1),
+        )
+        with self._lock:
+            dots = self._dots
+        if dots is not None:
+            dot = pick_dot(ray, dots[0])
+            if dot is not None:
+                dots[1](dot)
+                return
         with self._lock:
             content, scene, framing = self._content, self._scene, self._framing
             if content is None or scene is None or framing is None:
@@ -206,12 +226,6 @@ class Inspector:
             if grab is not None or take is not None:
                 # They are not where they were, or in the way.
                 content = dataclasses.replace(content, hands=())
-            camera = event.client.camera
-            ray = Ray(
-                origin=np.asarray(event.ray_origin, dtype=np.float64),
-                direction=np.asarray(event.ray_direction, dtype=np.float64),
-                pixel=float(camera.fov) / max(int(camera.image_height), 1),
-            )
             target = Target(
                 content=content,
                 rollout=rollout,

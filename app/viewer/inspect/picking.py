@@ -104,6 +104,20 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
     return found or _pick_marker(ray, target) or hand
 
 
+def pick_dot(ray: Ray, dot: Float[ndarray, "dot 3"]) -> int | None:
+    """Find the dot that a click means, the nearest to it; None if there is none near it.
+
+    Args:
+        ray: Where it points.
+        dot: Where the dots are, which nothing hides [m].
+    """
+    if not len(dot):
+        return None
+    pixels, _ = ray.offsets(dot)
+    number = int(np.argmin(pixels))
+    return number if pixels[number] <= NEAR_PIXELS else None
+
+
 def _pick_marker(ray: Ray, target: Target) -> Pick | None:
     """Find a marker of a recording; those that are held are under their control points."""
     markers = target.content.markers

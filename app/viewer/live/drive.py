@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.simulation.fingers import Fingers
 from physhandi.simulation.steering import Take, turn_between, turn_on
 
 LAG = 0.1
@@ -18,6 +19,8 @@ TOP_TURN = 2.0 * math.pi
 """A hand turns no faster than this [rad/s]."""
 _YIELDING = 0.2
 """Part of its top speed with which a hand gives way that is pulled at twice as hard as allowed."""
+_PARTS_OF_A_BEND = (1.0, 0.5, 0.25, 0.125, 0.0625)
+"""Parts of a step of a finger, of which the largest is taken that does not go into the ground."""
 _THERE = 1e-6
 """A hand that is so near to its goal is there [length unit, rad]."""
 
@@ -32,19 +35,22 @@ class HandOrder:
     """Place to go to: offset of the wrist [m] and rotation vector [rad]; None to move freely."""
     closing: float = 0.0
     """How fast the fingers close [1/s]; negative for opening."""
+    bend: tuple[float, ...] | None = None
+    """How far each finger shall be bent on top of that [rad], see `Fingers`; None for as it is."""
 
     def to_dict(self) -> dict[str, Any]:
         """Describe it in plain data."""
-        return {"velocity": self.velocity, "goal": self.goal, "closing": self.closing}
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> "HandOrder":
         """Rebuild it from plain data."""
-        goal = fields["goal"]
+        goal, bend = fields["goal"], fields["bend"]
         return cls(
             velocity=tuple(fields["velocity"]),
             goal=None if goal is None else tuple(goal),
             closing=float(fields["closing"]),
+            bend=None if bend is None else tuple(bend),
         )
 
 
@@ -63,11 +69,12 @@ class HandDrive:
 
     def __init__(
         self,
-        pose: Float[ndarray, " 7"],
+        pose: Float[ndarray, " pose"],
         *,
         frame_rate: float,
         limits: HandLimits,
-        depth: Callable[[Float[ndarray, " 7"]], float],
+        depth: Callable[[Float[ndarray, " pose"]], float],
+        fingers: Fingers | None = None,
     ) -> None:
         """Begin at rest.
 
@@ -77,6 +84,7 @@ class HandDrive:
             limits: How fast and how far it goes.
             depth: Tells how far a pose is too low [m]; the hand is lifted by so much. Negative for
                 a pose that is higher than it must be.
+            fingers: Its fingers, if they bend one by one.
         """
         self.order = HandOrder()
         """What the hand follows."""
@@ -89,10 +97,11 @@ class HandDrive:
         self._yielding = _YIELDING * limits.top_speed
         self._reach = limits.reach
         self._depth = depth
+        self._fingers = fingers
         self._velocity = np.zeros(6)
         self._closing = 0.0
 
-    def next(self, pull: Float[ndarray, " 3"]) -> Float[ndarray, " 7"]:
+    def next(self, pull: Float[ndarray, " 3"]) -> Float[ndarray, " pose"]:
         """Move on by a frame.
 
         Args:
@@ -119,8 +128,26 @@ class HandDrive:
         self.pose[3:6] = turn_on(self.pose[3:6], move[3:])
         self._closing += self._share * (self.order.closing - self._closing)
         self.pose[6] = np.clip(self.pose[6] + self._closing * self._step, -1.0, 1.0)
+        if self._fingers is not None:  # What keys close bends no joint farther than it goes.
+            self.pose[7:] = np.clip(self.pose[7:], *self._fingers.limits(self.pose[6]))
         self._stop_at_bounds(before)
+        self._bend()
         return self.pose.copy()
+
+    def _bend(self) -> None:
+        """Bend single fingers as they shall be, as far as joints go, and not into the ground."""
+        if self._fingers is None or self.order.bend is None:
+            return
+        now, most = self.pose[7:].copy(), TOP_TURN * self._step
+        away = np.clip(self.order.bend, *self._fingers.limits(self.pose[6])) - now
+        if np.abs(away).max() > _THERE:
+            away = np.clip(self._share * away, -most, most)
+        deepest = max(self._depth(self.pose), 0.0)
+        for part in _PARTS_OF_A_BEND:
+            self.pose[7:] = now + part * away
+            if self._depth(self.pose) <= deepest:
+                return
+        self.pose[7:] = now
 
     @property
     def _share(self) -> float:
@@ -178,6 +205,7 @@ class Drives:
                 frame_rate=take.parameters.frame_rate,
                 limits=limits,
                 depth=partial(take.depth_below_ground, number),
+                fingers=take.hands[number].fingers,
             )
             for number, pose in enumerate(take.pose[0])
         ]
@@ -193,7 +221,7 @@ class Drives:
             drive.order = HandOrder.from_dict(order)
             drive.most_force = math.inf if most_force is None else most_force
 
-    def next(self, pull: Float[ndarray, "hand 3"]) -> Float[ndarray, "hand 7"]:
+    def next(self, pull: Float[ndarray, "hand 3"]) -> Float[ndarray, "hand pose"]:
         """Move all hands on by a frame.
 
         Args:

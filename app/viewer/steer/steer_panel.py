@@ -29,20 +29,21 @@ from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
 from physhandi.errors import PhysHandiError, UsageError
-from physhandi.hand.curl import blended, curl_motion
+from physhandi.hand.curl import blended, curl_motion, finger_joints
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.fingers import CURLS, FINGERS, Fingers, curled
 from physhandi.simulation.restart import NodeState
 from physhandi.simulation.steering import (
-    CURLS,
+    POSE,
+    HandSurface,
     SteeredHand,
     Take,
-    curled,
     from_quaternion,
     to_quaternion,
 )
 
 GIZMO = "/steer/wrist"
-"""Path of the gizmo in the scene."""
+"""Path in the scene of the gizmo on the wrist, a fingertip or a point that is held."""
 _START, _STOP = "Steer (G)", "Back to playback (G)"
 _RECORD, _END_RECORDING = "Record (space)", "End recording (space)"
 _PLAY, _DISCARD = "Play", "Discard"
@@ -54,6 +55,13 @@ _GIZMO_SIZE = 0.22
 """Length of the gizmo's axes, as a part of the scene's extent."""
 _POINT_SIZE = 0.02
 """Size of a point that is held, likewise."""
+_TIP_COLOR = (236, 160, 20)
+_TIP_GIZMO_SIZE, _DOT_SIZE = 0.3, 0.07
+"""Length of the axes of a gizmo on a fingertip, and width of the dots by which fingers and wrists
+are chosen: as parts of the hand from its wrist to the tip of its middle finger."""
+_ABOVE_TIP, _ABOVE_WRIST = 0.045, 0.16
+"""How far from tips and wrist dots lie on the backs of fingers and hand, where they are seen:
+likewise."""
 _SPEED = 0.25
 """Speed of a wrist at first, in extents of the scene a second."""
 _TURN_SPEED = 90.0
@@ -69,8 +77,9 @@ _STYLE = "font-size:0.85em;line-height:1.5;padding:0.2em 0.9em 0.5em"
 _HOW = (
     "The object is simulated on from the frame that is shown while you move the hand: by the "
     "arrows and rings on its wrist, or by keys that you hold. <b>W S A D Q E</b> move it as you "
-    "see it, <b>I K J L U O</b> turn it, <b>R F</b> close and open its fingers. <b>X</b> lets go "
-    "of the object, and grips what is near. Click a point of the object to hold it there and pull. "
+    "see it, <b>I K J L U O</b> turn it, <b>R F</b> close and open its fingers; click the dot on a "
+    "fingertip to bend that finger alone. <b>X</b> lets go of the object, and grips what is near. "
+    "Click a point of the object to hold it there and pull. "
     "Ctrl Z takes back."
 )
 
@@ -83,8 +92,8 @@ class Recorded:
     """Its poses, and the state that they begin with."""
     frames: tuple[SteeredFrame, ...]
     """All its frames."""
-    vertices: Mapping[str, Float[ndarray, "curl vertex 3"]]
-    """Vertices of each hand in its pose of zero, for each of `CURLS` or for none [m]."""
+    surfaces: Mapping[str, HandSurface]
+    """Each hand in its pose of zero."""
     frame: int
     """Frame of the sequence from which the hands were steered."""
 
@@ -104,6 +113,32 @@ KeepTake = Callable[[Take, int, str, Callable[[SavedRun], None]], None]
 """Keeps a take that was steered from a frame on, under a name, and reports how far that is."""
 Shown = tuple[ObjectRollout, int, Mapping[str, Float[ndarray, "vertex 3"]]]
 """Rollout, its frame, and the vertices of each hand [m]."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What keys and the gizmo move: a hand, or one finger of it by its tip."""
+
+    hand: int
+    """Number of the hand, or of a point that is held."""
+    finger: int | None = None
+    """Number of the finger; None for the whole hand."""
+
+    def place(self, hand: SteeredHand, pose: Float[ndarray, " pose"]) -> Float[ndarray, " 3"]:
+        """Tell where its gizmo is [m]."""
+        return hand.wrist + pose[:3] if self.finger is None else hand.tip(self.finger, pose)
+
+    def dot(self, hand: SteeredHand, pose: Float[ndarray, " pose"]) -> Float[ndarray, " 3"] | None:
+        """Tell where the dot is by which it is chosen [m]; None for what has no fingers."""
+        if hand.fingers is None:
+            return None
+        fingers, size = hand.fingers, _length(hand)
+        if self.finger is None:
+            above = hand.wrist + _ABOVE_WRIST * size * fingers.back
+        else:
+            bent = pose[6], pose[7:]
+            above = (fingers.tips(*bent) + _ABOVE_TIP * size * fingers.nails(*bent))[self.finger]
+        return hand.moved(above[None], pose)[0]
 
 
 class SteerPanel:
@@ -163,10 +198,11 @@ class SteerPanel:
         self._take_folder: TakeFolder | None = None
         self._lock = threading.RLock()
         self._object: SteeredObject | None = None
-        self._hand = 0
+        self._moved = Moved(0)
+        self._dots: dict[Moved, Float[ndarray, " 3"]] = {}
         self._frame = 0
         self._was_playing = False
-        self._vertices: dict[str, ndarray] = {}
+        self._surfaces: dict[str, HandSurface] = {}
         self._held: frozenset[str] = frozenset()
         self._gizmo: viser.TransformControlsHandle | None = None
         self._take: Take | None = None
@@ -188,7 +224,7 @@ class SteerPanel:
             self._button = gui.add_button(_START, hint="G")
             self._status = gui.add_html("")
             self._choice: Any = gui.add_dropdown(
-                "Move", ("controls",), visible=False, hint="Hand, or point of the object"
+                "Move", ("controls",), visible=False, hint="Hand, finger, or point of the object"
             )
             self._grip_button = gui.add_button(
                 _LET_GO,
@@ -284,9 +320,9 @@ class SteerPanel:
                 self._tell()
             self._write()
             vertices = {
-                hand.name: hand.moved(curled(self._vertices[hand.name], pose[6]), pose)
+                hand.name: hand.moved(self._surfaces[hand.name].at(pose), pose)
                 for hand, pose in zip(newest.take.hands, newest.pose, strict=True)
-                if hand.name in self._vertices
+                if hand.name in self._surfaces
             }
         return rollout, frame, vertices
 
@@ -313,29 +349,32 @@ class SteerPanel:
         self._frame = playback.frame
         rollout, frame = self._rollout_at(self._frame)
         skins = self._skins()
-        vertices = {hand.side: self._shapes(hand, skins) for hand in self._content.hands}
+        surfaces = {hand.side: self._surface(hand, skins) for hand in self._content.hands}
         wrists = {
             hand.side: np.array(hand.joint[min(self._frame, len(hand.joint) - 1)][0], np.float64)
             for hand in self._content.hands
             if hand.joint is not None
         }
-        self._begin(begin_take(rollout, frame, vertices, wrists), vertices)
+        self._begin(begin_take(rollout, frame, surfaces, wrists), surfaces)
 
-    def _shapes(
-        self, hand: ShownHand, skins: Mapping[str, Mapping[str, ndarray]]
-    ) -> Float[ndarray, "curl vertex 3"]:
-        """Give the vertices of a hand in the frame, for each of `CURLS` if they have bones [m]."""
+    def _surface(self, hand: ShownHand, skins: Mapping[str, Mapping[str, ndarray]]) -> HandSurface:
+        """Give a hand in the frame; its fingers move if it has bones."""
         vertex = np.asarray(hand.vertex[min(self._frame, len(hand.vertex) - 1)], np.float64)
         skin = skins.get(hand.side)
         if skin is None or len(skin["vertex_bone"]) != len(vertex):
-            return vertex[None]
+            return HandSurface(shapes=vertex[None])
         motion = curl_motion(skin, hand.side, self._frame, CURLS)
         moved = blended(motion, skin["vertex_bone"], skin["vertex_weight"], vertex)
-        return vertex + (moved - curled(moved, 0.0))
+        shapes, fingers = vertex + (moved - curled(moved, 0.0)), None
+        if hand.joint is not None:
+            joint = np.asarray(hand.joint[min(self._frame, len(hand.joint) - 1)], np.float64)
+            joints = finger_joints(skin, hand.side, self._frame, CURLS, joint)
+            fingers = Fingers(**joints)
+        return HandSurface(shapes=shapes, fingers=fingers)
 
-    def _begin(self, take: Take, vertices: Mapping[str, Float[ndarray, "curl vertex 3"]]) -> None:
+    def _begin(self, take: Take, surfaces: Mapping[str, HandSurface]) -> None:
         """Simulate on from the state of a take; called under the lock."""
-        self._vertices = dict(vertices)
+        self._surfaces = dict(surfaces)
         self._object = SteeredObject(
             self._mailbox,
             self._live,
@@ -378,7 +417,7 @@ class SteerPanel:
             pose=np.stack([frame.pose for frame in frames]),
         )
         self._show_take(
-            Recorded(take=take, frames=frames, vertices=self._vertices, frame=self._frame)
+            Recorded(take=take, frames=frames, surfaces=self._surfaces, frame=self._frame)
         )
 
     def _show_take(self, recorded: Recorded | None) -> None:
@@ -410,7 +449,7 @@ class SteerPanel:
                 self._playback.seek(recorded.frame)
                 self._was_playing, self._frame = False, recorded.frame
                 self._stop_comparing()
-                self._begin(replace(take, pose=take.pose[:1]), recorded.vertices)
+                self._begin(replace(take, pose=take.pose[:1]), recorded.surfaces)
             if self._object is not None:
                 self._object.replay(take)
             self._tell()
@@ -426,7 +465,19 @@ class SteerPanel:
                 lambda take, state, pose: take.hold_point(node, state, pose, _unused_name(take))
             )
             self._offer(take)
-            self._select(len(take.hands) - 1)
+            self._select(Moved(len(take.hands) - 1))
+
+    @property
+    def dots(self) -> Float[ndarray, "dot 3"]:
+        """Dots by which hands and fingers are chosen, as they were drawn last [m]."""
+        with self._lock:
+            return np.reshape([*self._dots.values()], (-1, 3))
+
+    def choose_dot(self, number: int) -> None:
+        """Move the hand or the finger of one of `dots` from now on."""
+        with self._lock:
+            if self._object is not None and number < len(self._dots):
+                self._select(tuple(self._dots)[number])
 
     def _toggle_grip(self) -> None:
         """Let the chosen hand go, or grip what is near; a point is held no more."""
@@ -434,9 +485,10 @@ class SteerPanel:
             steered = self._object
             if steered is None or steered.is_replaying:
                 return
-            hand, is_point = self._hand, self._is_point(steered.take, self._hand)
+            hand = self._moved.hand
+            is_point = self._is_point(steered.take, hand)
 
-            def change(take: Take, state: NodeState, pose: Float[ndarray, "hand 7"]) -> Take:
+            def change(take: Take, state: NodeState, pose: Float[ndarray, "hand pose"]) -> Take:
                 if is_point:
                     return take.without_point(hand, state, pose)
                 if take.holds(hand):
@@ -452,7 +504,7 @@ class SteerPanel:
             except UsageError as error:
                 notify(self._server, "Nothing to grip", str(error), seconds=4.0)
             if is_point:
-                self._select(0)
+                self._select(Moved(0))
             self._write(at_once=True)
 
     def _is_point(self, take: Take, hand: int) -> bool:
@@ -464,24 +516,27 @@ class SteerPanel:
         if self._take is take:
             return
         before, self._take = self._take, take
-        names = tuple(hand.name for hand in take.hands)
-        if before is None or names != tuple(hand.name for hand in before.hands):
-            self._choice.options = names
+        names = _choices(take)
+        if before is None or tuple(names) != tuple(_choices(before)):
+            self._choice.options = tuple(names)
             self._choice.visible = len(names) > 1
-            self._select(min(self._hand, len(names) - 1))
+            last = len(take.hands) - 1
+            self._select(
+                self._moved if self._moved in names.values() else Moved(min(self._moved.hand, last))
+            )
 
-    def _select(self, hand: int) -> None:
-        """Move another hand from now on; the others stay where they are."""
+    def _select(self, moved: Moved) -> None:
+        """Move another hand or finger from now on; the others stay where they are."""
         steered, take = self._object, self._take
         if steered is None or take is None:
             return
-        self._hand = hand
+        self._moved = moved
         for other in range(len(take.hands)):
-            if other != hand:
+            if other != moved.hand:
                 steered.order(other, HandOrder())
         self._remove_gizmo()
-        self._add_gizmo(take.hands[hand], turns=not self._is_point(take, hand))
-        name = take.hands[hand].name
+        self._add_gizmo(take, steered.newest.pose)
+        name = next(name for name, its in _choices(take).items() if its == moved)
         if self._choice.value != name:
             self._choice.value = name
         self._tell()
@@ -493,13 +548,17 @@ class SteerPanel:
             self._gizmo.remove()
         self._gizmo, self._is_dragged = None, False
 
-    def _add_gizmo(self, hand: SteeredHand, *, turns: bool) -> None:
+    def _add_gizmo(self, take: Take, pose: Float[ndarray, "hand pose"]) -> None:
+        number, finger = self._moved.hand, self._moved.finger
+        hand = take.hands[number]
         gizmo = self._gizmo = self._server.scene.add_transform_controls(
             GIZMO,
-            scale=_GIZMO_SIZE * self._extent,
-            disable_rotations=not turns,
+            scale=(
+                _GIZMO_SIZE * self._extent if finger is None else _TIP_GIZMO_SIZE * _length(hand)
+            ),
+            disable_rotations=finger is not None or self._is_point(take, number),
             depth_test=False,
-            position=hand.wrist,
+            position=self._moved.place(hand, pose[number]),
         )
 
         # In the order in which the browser has sent them, which threads would not keep.
@@ -520,20 +579,28 @@ class SteerPanel:
                 return
             if event.phase == "end":
                 self._is_dragged = False
-            hands = steered.take.hands
-            if self._hand >= len(hands):
+            number, finger = self._moved.hand, self._moved.finger
+            newest = steered.newest
+            if number >= len(newest.take.hands):
                 return
-            hand = hands[self._hand]
+            hand, told = newest.take.hands[number], steered.order_of(number)
             try:
-                goal = _goal(hand, event.target.position, event.target.wxyz)
-                steered.order(self._hand, HandOrder(goal=goal))
+                if finger is None:
+                    goal = _goal(hand, event.target.position, event.target.wxyz)
+                    steered.order(number, HandOrder(goal=goal, bend=told.bend))
+                    return
+                pose = newest.pose[number].copy()
+                if told.bend is not None:
+                    pose[7:] = told.bend
+                bend = hand.follow(finger, event.target.position, pose)
+                steered.order(number, replace(told, bend=tuple(float(angle) for angle in bend)))
             except PhysHandiError as error:
                 if str(error) != self._refused:
                     self._refused = str(error)
                     notify(event.client, "Not possible", self._refused)
 
     def _follow(self, frame: SteeredFrame) -> None:
-        """Put the gizmo where the hand is, unless it is being dragged, and draw held points."""
+        """Put the gizmo where the hand is, unless it is being dragged, and draw dots to click."""
         hands = frame.take.hands
         points = [
             hand.wrist + pose[:3]
@@ -547,12 +614,25 @@ class SteerPanel:
             _POINT_SIZE * self._extent,
             is_visible=True,
         )
+        self._dots = {
+            moved: place
+            for moved in _choices(frame.take).values()
+            if moved != self._moved
+            and (place := moved.dot(hands[moved.hand], frame.pose[moved.hand])) is not None
+        }
+        self._nodes.spheres(
+            "/steer/dots",
+            self.dots,
+            _TIP_COLOR,
+            _dot_width(frame.take),
+            is_visible=True,
+        )
         gizmo = self._gizmo
         if gizmo is None or self._is_dragged:
             return
-        pose = frame.pose[self._hand]
-        position = hands[self._hand].wrist + pose[:3]
-        wxyz = to_quaternion(pose[3:6])
+        pose = frame.pose[self._moved.hand]
+        position = self._moved.place(hands[self._moved.hand], pose)
+        wxyz = to_quaternion(pose[3:6] if self._moved.finger is None else np.zeros(3))
         if not np.allclose(gizmo.position, position, atol=1e-6 * self._extent):
             gizmo.position = position
         if not np.allclose(gizmo.wxyz, wxyz, atol=1e-6):
@@ -561,9 +641,9 @@ class SteerPanel:
     def _choose(self, name: str) -> None:
         """Move another hand; the one before stays where it is."""
         with self._lock:
-            names = [] if self._take is None else [hand.name for hand in self._take.hands]
+            names = {} if self._take is None else _choices(self._take)
             if name in names:
-                self._select(names.index(name))
+                self._select(names[name])
 
     def _hold(self, held: frozenset[str]) -> None:
         """Move the hand while keys are held."""
@@ -581,7 +661,9 @@ class SteerPanel:
         turn_speed = math.radians(self._turn_speed.value)
         velocity = velocity_of(self._held, self._axes(), self._speed.value, turn_speed)
         closing = _CLOSING * (("KeyR" in self._held) - ("KeyF" in self._held))
-        steered.order(self._hand, HandOrder(velocity=velocity, closing=closing))
+        hand = self._moved.hand
+        bend = steered.order_of(hand).bend
+        steered.order(hand, HandOrder(velocity=velocity, closing=closing, bend=bend))
 
     def _weight(self) -> float:
         """Tell what the object weighs, as forces are shown [N]."""
@@ -630,12 +712,14 @@ class SteerPanel:
         """Tell the page whether keys steer."""
         state: dict[str, Any] = {"steering": self.is_on}
         if self.is_on and self._take is not None:
-            name = self._take.hands[self._hand].name
+            number, finger = self._moved.hand, self._moved.finger
+            name = self._take.hands[number].name
             hand = " hand" if self._content.hands else ""
-            is_point = self._is_point(self._take, self._hand)
+            is_point = self._is_point(self._take, number)
             state["what"] = name if is_point else f"the {name}{hand}"
             state["turns"] = not is_point
-            state["curls"] = self._take.hands[self._hand].curls is not None
+            state["curls"] = self._take.hands[number].curls is not None
+            state["finger"] = "" if finger is None else FINGERS[finger]
             state["recording"] = self._object is not None and self._object.is_recording
         self._channel.tell(state)
 
@@ -665,15 +749,16 @@ class SteerPanel:
 
     def _pull(self, frame: SteeredFrame) -> str:
         """Say how hard the object pulls at what is moved."""
-        if frame.pull is None or self._hand >= len(frame.pull):
+        hand = self._moved.hand
+        if frame.pull is None or hand >= len(frame.pull):
             return ""
-        force = self._newtons() * float(np.linalg.norm(frame.pull[self._hand]))
+        force = self._newtons() * float(np.linalg.norm(frame.pull[hand]))
         return f"<br>the object pulls with {force:.2g} N"
 
     def _show_buttons(self, steered: SteeredObject | None) -> None:
         """Say on the buttons what they would do now; those that do nothing are hidden."""
         is_on, take = steered is not None, self._take
-        holds = take is not None and take.holds(self._hand)
+        holds = take is not None and take.holds(self._moved.hand)
         is_recording = steered is not None and steered.is_recording
         for button, is_visible, label in (
             (self._button, True, _STOP if is_on else _START),
@@ -764,6 +849,29 @@ class TakeFolder:
 
     def _report(self, run: SavedRun) -> None:
         write_small(self._progress, saved_html(run))
+
+
+def _choices(take: Take) -> dict[str, Moved]:
+    """Name all that can be moved."""
+    names: dict[str, Moved] = {}
+    for number, hand in enumerate(take.hands):
+        names[hand.name] = Moved(number)
+        if hand.fingers is not None:
+            for finger, name in enumerate(FINGERS):
+                names[f"{hand.name} {name}"] = Moved(number, finger)
+    return names
+
+
+def _dot_width(take: Take) -> float:
+    """Tell how wide dots on hands are [m]."""
+    lengths = [_length(hand) for hand in take.hands if hand.fingers is not None]
+    return _DOT_SIZE * max(lengths, default=0.0)
+
+
+def _length(hand: SteeredHand) -> float:
+    """Tell how long a hand with fingers is, from its wrist to the tip of its middle finger [m]."""
+    tip = hand.tip(FINGERS.index("middle finger"), np.zeros(POSE))
+    return float(np.linalg.norm(tip - hand.wrist))
 
 
 def _unused_name(take: Take) -> str:

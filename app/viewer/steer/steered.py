@@ -14,8 +14,9 @@ from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import Message
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.fingers import curled
 from physhandi.simulation.restart import NodeState
-from physhandi.simulation.steering import POSE, SteeredHand, Take, curled, nearest_surface
+from physhandi.simulation.steering import POSE, HandSurface, SteeredHand, Take, nearest_surface
 
 TOP_SPEED = 3.0
 """A wrist moves no faster than this many extents of the scene in a second."""
@@ -39,7 +40,7 @@ class SteeredFrame:
     """Object nodes [m]."""
     velocity: Float32[ndarray, "node 3"]
     """Their velocities [m/s]."""
-    pose: Float[ndarray, "hand 7"]
+    pose: Float[ndarray, "hand pose"]
     """Poses of the hands; see `Take`."""
     pull: Float[ndarray, "hand 3"] | None = None
     """How the object pulls at each hand [N]; None before the first frame was simulated."""
@@ -48,7 +49,7 @@ class SteeredFrame:
 def begin_take(
     rollout: ObjectRollout,
     frame: int,
-    hands: Mapping[str, Float[ndarray, "curl vertex 3"]],
+    hands: Mapping[str, HandSurface],
     wrists: Mapping[str, Float[ndarray, " 3"]],
 ) -> Take:
     """Let hands be steered from a frame of a rollout on.
@@ -58,7 +59,7 @@ def begin_take(
     Args:
         rollout: The object's motion.
         frame: Frame of the rollout.
-        hands: Vertices of each hand in the frame, for each of `CURLS` or for none [m].
+        hands: Each hand in the frame.
         wrists: Wrist of each hand [m]; the middle of the hand where it is not known.
 
     Raises:
@@ -71,18 +72,18 @@ def begin_take(
         raise UsageError("Nothing holds this object, so there is no hand to steer.")
     recorded = np.asarray(rollout.control[frame], np.float64)
     if hands:
-        surfaces = [curled(shapes, 0.0) for shapes in hands.values()]
+        surfaces = [curled(hand.shapes, 0.0) for hand in hands.values()]
         owner = nearest_surface(recorded[:moving], surfaces)
         steered = tuple(
             SteeredHand.of_surface(
                 name,
-                shapes,
+                hand,
                 control=np.flatnonzero(owner == number),
                 recorded=recorded,
                 place=control,
                 wrist=wrists.get(name),
             )
-            for number, (name, shapes) in enumerate(hands.items())
+            for number, (name, hand) in enumerate(hands.items())
         )
     else:
         every = np.arange(moving)
@@ -175,7 +176,8 @@ class SteeredObject:
         Raises:
             UsageError: If a number is not finite, or the goal is out of reach.
         """
-        for name, values in (("velocity", order.velocity), ("goal", order.goal or ())):
+        told = {"velocity": order.velocity, "goal": order.goal or (), "bend": order.bend or ()}
+        for name, values in told.items():
             if not np.all(np.isfinite(values)):
                 raise UsageError(f"The {name} of a hand must be finite numbers, not {values}.")
         reach = self._limits.reach
@@ -186,6 +188,11 @@ class SteeredObject:
                 return
             self._orders[hand] = order
             self._drive()
+
+    def order_of(self, hand: int) -> HandOrder:
+        """Give the order that a hand follows."""
+        with self._lock:
+            return self._orders[hand]
 
     def limit_force(self, most: float | None) -> None:
         """Let hands give way that the object pulls at harder than this, from now on.
@@ -206,7 +213,9 @@ class SteeredObject:
         with self._lock:
             self._undone.append(self._newest)
 
-    def regrip(self, change: Callable[[Take, NodeState, Float[ndarray, "hand 7"]], Take]) -> Take:
+    def regrip(
+        self, change: Callable[[Take, NodeState, Float[ndarray, "hand pose"]], Take]
+    ) -> Take:
         """Change what the hands hold; what was recorded is not recorded any more.
 
         Args:

@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from app.viewer.live.drive import LAG, TOP_TURN, Drives, HandDrive, HandLimits, HandOrder
+from physhandi.simulation.fingers import BENDS, CURLS, Fingers
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.steering import SteeredHand, Take
+from physhandi.simulation.steering import POSE, SteeredHand, Take
 from physhandi.simulation.topology import build_model
 
 RATE = 30.0
@@ -22,7 +24,7 @@ def drive(
     depth: Callable[[np.ndarray], float] = lambda _: -math.inf,
 ) -> HandDrive:
     limits = HandLimits(top_speed=top_speed, reach=reach)
-    return HandDrive(np.zeros(7), frame_rate=RATE, limits=limits, depth=depth)
+    return HandDrive(np.zeros(POSE), frame_rate=RATE, limits=limits, depth=depth)
 
 
 def two_hands(**changes: object) -> Take:
@@ -43,7 +45,7 @@ def two_hands(**changes: object) -> Take:
         parameters=parameters,
         control=control,
         hands=hands,
-        pose=np.zeros((1, 2, 7)),
+        pose=np.zeros((1, 2, POSE)),
     )
 
 
@@ -101,7 +103,7 @@ def test_each_hand_follows_its_own_order_until_the_next() -> None:
     for _ in range(40):
         pose = drives.next(np.zeros((2, 3)))
     assert pose[0, 1] == pytest.approx(0.1 * (40 / RATE - LAG), abs=0.003)
-    np.testing.assert_allclose(pose[1], [0.2, 0, 0, 0, 0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(pose[1], [0.2, *np.zeros(POSE - 1)], atol=1e-5)
     np.testing.assert_array_equal(pose[0, [0, 2, 3, 4, 5]], 0.0)
 
 
@@ -150,7 +152,9 @@ def test_a_hand_gives_way_along_a_pull_that_is_too_strong() -> None:
         hand.order = HandOrder(velocity=(0.3, 0.0, 0.6, 0.0, 0.0, 0.0))
         way = np.stack([hand.next(np.array([0.0, 0.0, -force])) for _ in range(60)])
         last = RATE * (way[-1] - way[-2])
-        np.testing.assert_allclose(last, [0.3, 0, speed, 0, 0, 0, 0], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(
+            last, [0.3, 0, speed, *np.zeros(POSE - 3)], rtol=1e-6, atol=1e-12
+        )
     # One that is told to go along the pull, and faster, does so.
     hand.order = HandOrder(velocity=(0.0, 0.0, -1.0, 0.0, 0.0, 0.0))
     way = np.stack([hand.next(np.array([0.0, 0.0, -12.5])) for _ in range(60)])
@@ -169,3 +173,67 @@ def test_fingers_close_while_a_key_is_held_and_no_farther_than_a_fist() -> None:
             pose = hand.next(NO_PULL)
         assert pose[6] == end
     assert HandOrder.from_dict(hand.order.to_dict()) == hand.order
+
+
+def with_fingers(take: Take) -> Take:
+    """Both hands have straight fingers along x that bend down at the wrist, and there alone.
+
+    The second of their control nodes, 4 cm away, hangs on the first finger.
+    """
+    hands = []
+    for hand in take.hands:
+        joint = np.tile(hand.wrist, (len(CURLS), 15, 1))
+        weight = np.zeros((2, 15))
+        weight[1, 0] = 1.0
+        fingers = Fingers(
+            origin=joint,
+            axis=np.tile([0.0, 1.0, 0.0], (len(CURLS), 15, 1)),
+            swing_axis=np.tile([0.0, 0.0, 1.0], (5, 1)),
+            tip=joint[:, :5] + [0.04, 0.0, 0.0],
+            turn=np.tile(np.maximum(CURLS, 0.0)[:, None], (1, 15)),
+            low=np.full(BENDS, -0.2),
+            high=np.full(BENDS, 1.5),
+            weight=weight,
+        )
+        curls = np.repeat(take.control[hand.control][None], len(CURLS), axis=0)
+        hands.append(replace(hand, curls=curls, fingers=fingers))
+    return replace(take, hands=tuple(hands))
+
+
+def test_a_finger_goes_smoothly_to_its_bend_and_no_farther_than_its_joint() -> None:
+    take = with_fingers(two_hands(ground_height=None))
+    drives = Drives(take, HandLimits(top_speed=1.0, reach=1.0))
+    bend = np.zeros(BENDS)
+    bend[[1, 6]] = [0.1, 9.0]
+    orders = [HandOrder(bend=tuple(bend)), HandOrder()]
+    drives.obey([order.to_dict() for order in orders], None)
+    way = np.stack([drives.next(np.zeros((2, 3))) for _ in range(60)])
+    lag = np.exp(-np.arange(1, 61) / (RATE * LAG))
+    np.testing.assert_allclose(way[:, 0, 8], 0.1 * (1.0 - lag), atol=2e-6)
+    assert way[-1, 0, 13] == pytest.approx(1.5)
+    assert np.diff(way[:, 0, 13]).max() <= TOP_TURN / RATE + 1e-12
+    np.testing.assert_array_equal(np.delete(way[:, 0], [8, 13], axis=1), 0.0)
+    np.testing.assert_array_equal(way[:, 1], 0.0)
+    # What all fingers close is taken from what one may bend.
+    drives.obey([HandOrder(closing=0.8).to_dict()] * 2, None)
+    for _ in range(90):
+        pose = drives.next(np.zeros((2, 3)))
+    np.testing.assert_allclose(pose[0, [6, 8, 13]], [1.0, 0.1, 0.5], atol=2e-6)
+    assert HandOrder.from_dict(orders[0].to_dict()) == orders[0]
+
+
+def test_a_finger_stops_above_the_ground_and_its_wrist_stays() -> None:
+    take = with_fingers(two_hands())
+    drives = Drives(take, HandLimits(top_speed=1.0, reach=1.0))
+    lowered, bend = 0.03, np.zeros(BENDS)
+    drives.obey([HandOrder(goal=(0.0, 0.0, -lowered, 0.0, 0.0, 0.0)).to_dict()] * 2, None)
+    for _ in range(90):
+        before = drives.next(np.zeros((2, 3)))[0]
+    bend[1] = 1.5  # 4 cm below its wrist, which is 1 cm above the ground.
+    drives.obey([HandOrder(bend=tuple(bend)).to_dict()] * 2, None)
+    way = np.stack([drives.next(np.zeros((2, 3)))[0] for _ in range(90)])
+    np.testing.assert_array_equal(np.delete(way - before, 8, axis=1), 0.0)
+    moved = np.stack([before, *way])[:, None] * [[1.0], [0.0]]
+    height = np.stack([take.control_at(pose)[1, 2] for pose in moved])
+    assert (np.diff(height) <= 1e-7).all()
+    assert GROUND - 1e-7 <= height[-1] < GROUND + 5e-4

@@ -23,7 +23,7 @@ from app.viewer.live.worker import SimulationWorker
 from physhandi.fitted_object import FittedObject
 from physhandi.run import Run
 from physhandi.simulation.edits import Cut, Pin, Release
-from physhandi.simulation.steering import SteeredHand, Take
+from physhandi.simulation.steering import POSE, SteeredHand, Take
 
 LIMITS = HandLimits(top_speed=0.5, reach=1.0)
 TESTS = Path(__file__).parents[2]
@@ -170,7 +170,7 @@ def steered(run: Run) -> Take:
 
 def test_steering_as_was_recorded_gives_the_recorded_rollout(live, mailbox, run) -> None:
     control = run.array("sequences/lift/control.npy").astype(np.float64)
-    pose = np.zeros((FRAMES, 1, 7))
+    pose = np.zeros((FRAMES, 1, POSE))
     pose[:, 0, :3] = (control - control[0]).mean(axis=1)
     live.steer("a", replace(steered(run), pose=pose), LIMITS, replays=True, is_paced=False)
     messages = mailbox.until("finished")
@@ -223,7 +223,7 @@ def test_a_hand_that_is_pressed_into_the_table_stays_on_it(live, mailbox, run) -
 def test_a_hand_pulls_no_harder_than_it_may(live, mailbox, run, most: float | None) -> None:
     take = steered(run)
     far = take.hold_point(0, take.start, take.pose[0], "point 1")
-    number = live.steer("a", replace(far, pose=np.zeros((1, 2, 7))), LIMITS, is_paced=False)
+    number = live.steer("a", replace(far, pose=np.zeros((1, 2, POSE))), LIMITS, is_paced=False)
     goal = (0.0, 0.0, 0.3, 0.0, 0.0, 0.0)
     live.drive("a", [HandOrder(goal=goal), HandOrder()], most)
     height, driven = 0.0, 0

@@ -15,15 +15,19 @@ from app.settings import BUNDLED
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from app.viewer.steer.steer_panel import GIZMO, Recorded
+from app.viewer.steer.steered import SteeredObject
 from physhandi.data.sequence import Sequence
 from physhandi.fitted_object import FittedObject
 from physhandi.pipeline import run_job
 from physhandi.run import Run
+from physhandi.simulation.steering import POSE
 
 AT = 8
 STEER, BACK = "Steer (G)", "Back to playback (G)"
 NODES = "/object/nodes"
 HAND = "/hand/right"
+DOTS = "/steer/dots"
+TIPS = [4, 8, 12, 16, 20]
 
 
 @pytest.fixture
@@ -73,6 +77,7 @@ def test_a_held_key_moves_hand_gizmo_and_object_until_it_is_let_go(scene, run) -
         "what": "the controls",
         "turns": True,
         "curls": False,
+        "finger": "",
         "recording": False,
     }
     assert json.loads(told[-1]) == says
@@ -99,23 +104,26 @@ def run_nodes(run) -> np.ndarray:
     return run.array("sequences/lift/rollout.npy").mean(axis=1)
 
 
+def drag(client: ViewerClient, place: np.ndarray, wxyz=(1.0, 0.0, 0.0, 0.0)) -> None:
+    """Drag the gizmo to a place at once."""
+    fields = {"name": GIZMO, "owner": ""}
+    position = [float(value) for value in place]
+    client.send("TransformControlsDragStartMessage", **fields)
+    client.send("TransformControlsUpdateMessage", wxyz=wxyz, position=position, **fields)
+    client.send("TransformControlsDragEndMessage", **fields)
+
+
 def test_the_hand_follows_the_gizmo_and_no_farther_than_it_reaches(scene) -> None:
     session, client = scene
     start = steer(client)
     object_ = session._steer._object
 
-    def drag(position, wxyz=(1.0, 0.0, 0.0, 0.0)) -> None:
-        fields = {"name": GIZMO, "owner": ""}
-        client.send("TransformControlsDragStartMessage", **fields)
-        client.send("TransformControlsUpdateMessage", wxyz=wxyz, position=position, **fields)
-        client.send("TransformControlsDragEndMessage", **fields)
-
     half = 0.5**0.5
-    drag([float(v) for v in start + np.array([0.0, 0.02, 0.03])], (half, 0.0, 0.0, half))
+    drag(client, start + np.array([0.0, 0.02, 0.03]), (half, 0.0, 0.0, half))
     goal = [0.0, 0.02, 0.03, 0.0, 0.0, np.pi / 2]
     wait(client, lambda: np.allclose(object_.newest.pose[0, :6], goal, atol=1e-5))
     for place, why in (((np.nan,) * 3, "finite numbers"), ((1e9, 0.0, 0.0), "no farther")):
-        drag(place)
+        drag(client, np.array(place))
         wait(
             client,
             lambda why=why: any(
@@ -294,6 +302,76 @@ def test_the_fingers_of_a_hand_close_while_a_key_is_held(towel: Session) -> None
         assert near.any()
         assert moved()[near].max() < 1e-3
         assert moved().max() > 0.03
+
+
+@pytest.fixture
+def index(towel: Session) -> Iterator[tuple[ViewerClient, SteeredObject, np.ndarray]]:
+    """The towel whose index finger is chosen by a click on its dot; and the joints of its hand."""
+    session = towel
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        told: list[str | None] = []
+        session.keys.listen(told.append)
+        rest_at(client, AT)
+        wait(client, lambda: session._playback.frame == AT and HAND in client.nodes)
+        wrist = steer(client)
+        object_ = session._steer._object
+        wait(client, lambda: object_.newest.pull is not None and DOTS in client.nodes)
+        joint = session._content.hands[0].joint[AT].astype(float)
+        np.testing.assert_allclose(wrist, joint[0], atol=1e-6)
+        dots = client.array(DOTS, "batched_positions")
+        np.testing.assert_allclose(np.linalg.norm(dots - joint[TIPS], axis=1), 0.0077, atol=0.002)
+        wait(client, lambda: session._inspector._grab is not None)
+        session._inspector._click(looking_down_at(dots[1]), prefers_hand=False)
+        wait(client, lambda: client.value("Move") == "right index finger")
+        wait(client, lambda: np.allclose(client.positions[GIZMO], joint[8], atol=1e-6))
+        assert json.loads(told[-1])["finger"] == "index finger"
+        yield client, object_, joint
+
+
+def tip_of(object_: SteeredObject) -> np.ndarray:
+    return object_.take.hands[0].tip(1, object_.newest.pose[0])
+
+
+def test_a_fingertip_follows_the_gizmo_and_its_wrist_stays(towel: Session, index) -> None:
+    client, object_, joint = index
+    before = client.array(HAND, "vertices")
+    target = joint[8] + [0.005, 0.0, 0.03]
+    drag(client, target)
+    wait(client, lambda: np.allclose(tip_of(object_), target, atol=2e-6))
+    pose = object_.newest.pose[0]
+    np.testing.assert_array_equal(pose[:11], 0.0)  # Wrist, curl and thumb.
+    np.testing.assert_array_equal(pose[15:], 0.0)
+    # What is drawn, and what holds the object, is the finger that went up.
+    control = object_.take.control_at(object_.newest.pose)
+    wait(client, lambda: np.allclose(client.array(HAND, "vertices"), control, atol=1e-5))
+    moved = client.array(HAND, "vertices") - before
+    nearest = np.argmin(np.linalg.norm(before - joint[8], axis=1))
+    np.testing.assert_allclose(moved[nearest], target - joint[8], atol=0.008)
+    at_wrist = np.linalg.norm(before - joint[0], axis=1) < 0.03
+    assert np.linalg.norm(moved[at_wrist], axis=1).max() < 1e-4
+
+    # A hand that moves takes its finger along, bent as it is.
+    hold(towel, "KeyE")
+    wait(client, lambda: object_.newest.pose[0, 2] > 0.01)
+    hold(towel)
+    np.testing.assert_allclose(object_.newest.pose[0, 7:], pose[7:], atol=1e-3)
+    for state in (pose, np.zeros(POSE)):
+        press(towel, "undo")
+        wait(client, lambda state=state: np.allclose(object_.newest.pose[0], state, atol=1e-3))
+    wait(client, lambda: np.allclose(client.positions[GIZMO], joint[8], atol=1e-6))
+
+
+def test_a_fingertip_goes_as_far_as_it_can_and_its_gizmo_comes_back_to_it(index) -> None:
+    client, object_, joint = index
+    drag(client, joint[8] + [0.0, 0.0, 0.5])
+    wait(client, lambda: tip_of(object_)[2] > joint[8, 2] + 0.04)
+    wait(client, lambda: np.allclose(client.positions[GIZMO], tip_of(object_), atol=1e-4))
+    assert client.positions[GIZMO][2] < joint[8, 2] + 0.06
+    notices = len(client.messages)
+    drag(client, np.full(3, np.nan))
+    wait(client, lambda: any("finite" in str(m) for m in client.messages[notices:]))
+    client.set("Move", "right")
+    wait(client, lambda: np.allclose(client.positions[GIZMO], joint[0], atol=1e-6))
 
 
 def test_a_hand_lets_go_and_grips_what_is_near_it(scene) -> None:

@@ -13,13 +13,14 @@ from physhandi.errors import RunError, UsageError
 from physhandi.fitted_object import FittedObject
 from physhandi.fitting.steered_run import contacts_from
 from physhandi.fitting.stored_take import TAKE_FILE, StoredTake
-from physhandi.hand.curl import blended, curl_motion
+from physhandi.hand.curl import blended, curl_motion, finger_joints
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.pipeline import run_job
 from physhandi.run import Run
 from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
-from physhandi.simulation.steering import CURLS, SteeredHand, Take
+from physhandi.simulation.fingers import CURLS, Fingers
+from physhandi.simulation.steering import POSE, HandSurface, SteeredHand, Take
 
 AT, FRAMES = 20, 4
 TOWEL = BUNDLED / "runs" / "towel_fold_quick"
@@ -34,7 +35,7 @@ def taken() -> Take:
     hand = SteeredHand(
         name="right", control=np.arange(len(control)), wrist=joints[AT, 0].astype(np.float64)
     )
-    pose = np.linspace(0, 1, FRAMES)[:, None, None] * [[0.0, 0.0, 0.02, 0.6, 0.0, 0.0, 0.0]]
+    pose = np.linspace(0, 1, FRAMES)[:, None, None] * [[0.0, 0.0, 0.02, 0.6, *np.zeros(POSE - 4)]]
     return Take(
         model=model,
         start=start,
@@ -169,6 +170,43 @@ def test_a_hand_that_closes_is_stored_with_its_bones(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def test_a_finger_that_bends_is_stored_with_its_bones(tmp_path: Path) -> None:
+    take, source = taken(), Run.open(TOWEL)
+    files, was = SequenceFiles("up"), SequenceFiles("towel_fold")
+    vertex = source.array(was.hand_vertex("right"))[AT].astype(np.float64)
+    joint = source.array(was.hand_keypoint("right"))[AT].astype(np.float64)
+    skin = source.tensors(was.hand_skin("right"))
+    motion = curl_motion(skin, "right", AT, CURLS)
+    fingers = Fingers(**finger_joints(skin, "right", AT, CURLS, joint))
+    shapes = blended(motion, skin["vertex_bone"], skin["vertex_weight"], vertex)
+    hand = SteeredHand.of_surface(
+        "right",
+        HandSurface(shapes=shapes, fingers=fingers),
+        control=take.hands[0].control,
+        recorded=take.control.astype(np.float64),
+        place=take.control,
+        wrist=take.hands[0].wrist,
+    )
+    pose = take.pose.copy()
+    pose[:, 0, 11:15] = np.linspace(0.0, 1.0, FRAMES)[:, None] * [0.1, -0.4, -0.3, -0.2]
+    run = run_of(replace(take, hands=(hand,), pose=pose), tmp_path)
+    stored = run.array(files.hand_vertex("right"))
+    # The stored surface is where the control nodes are, and its tip where the bones bring it.
+    np.testing.assert_allclose(run.array(files.control)[-1], stored[-1], atol=1e-5)
+    keypoint = run.array(files.hand_keypoint("right"))
+    np.testing.assert_allclose(keypoint[-1, 8], hand.tip(1, pose[-1, 0]), atol=1e-6)
+    still = hand.moved(joint, pose[-1, 0])
+    assert np.linalg.norm(keypoint[-1, 8] - still[8]) > 0.02
+    np.testing.assert_allclose(
+        np.delete(keypoint[-1], [6, 7, 8], 0), np.delete(still, [6, 7, 8], 0), atol=1e-6
+    )
+    model = load_hand_model("right")
+    moved = HandMotion.from_tensors(run.tensors(files.hand_motion("right")))
+    np.testing.assert_allclose(moved.keypoints(model), keypoint, atol=1e-4)
+    offset = np.linalg.norm(moved.vertices(model) - stored, axis=2).mean(axis=1)
+    np.testing.assert_allclose(offset, offset[0], atol=5e-4)
+
+
 def test_edited_springs_stay_in_a_run_that_was_steered(tmp_path: Path) -> None:
     take = taken()
     stiffness = take.model.stiffness.copy()
@@ -188,7 +226,7 @@ def test_what_was_gripped_by_hand_is_stored_and_built_again(tmp_path: Path) -> N
     node = int(np.argmin(take.start[0][:, 0]))
     held = take.hold_point(node, take.start, take.pose[0], "point 1")
     free = held.let_go(0, take.start, held.pose[0])
-    pose = np.zeros((FRAMES, 2, 7))
+    pose = np.zeros((FRAMES, 2, POSE))
     pose[:, 1, 2] = np.linspace(0, 0.02, FRAMES)
     run = run_of(replace(free, pose=pose), tmp_path)
     object_ = FittedObject.of(run)

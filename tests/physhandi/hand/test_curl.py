@@ -4,36 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hand_scene import flat_and_bent
 from scipy.spatial.transform import Rotation
 
 from physhandi.hand.curl import BONE_OF_KEYPOINT, blended, curl_motion, curled_rotations
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import hand_skin
 
 AMOUNTS = np.array([-0.5, 0.0, 0.4, 1.0])
 TIPS, KNUCKLES = [8, 12, 16, 20], [5, 9, 13, 17]
 
 
-def motion_of(side: str) -> HandMotion:
-    """A hand of two frames, of which the second is bent a little everywhere."""
-    mirror = np.array([1.0, 1.0, 1.0] if side == "right" else [1.0, -1.0, -1.0])
-    rng = np.random.default_rng(4)
-    bent = np.zeros((2, 15, 3))
-    bent[1] = 0.1 * rng.normal(size=(15, 3)) - [0.3, 0.0, 0.0]
-    return HandMotion(
-        side=side,
-        shape=np.zeros(10),
-        articulation=bent * mirror,
-        wrist_rotation=np.array([[0.0, 0.0, 0.0], [0.2, -0.4, 0.1]]) * mirror,
-        wrist_translation=np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]]) * [mirror[1], 1.0, 1.0],
-    )
-
-
 @pytest.fixture(scope="module", params=["right", "left"])
 def hand(request) -> tuple:
     model = load_hand_model(request.param)
-    motion = motion_of(request.param)
+    motion = flat_and_bent(request.param)
     return model, motion, hand_skin(model, motion).to_tensors()
 
 

@@ -27,7 +27,7 @@ from physhandi.simulation.edits import (
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.rod import Rod
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.steering import SteeredHand, Take
+from physhandi.simulation.steering import POSE, SteeredHand, Take
 
 STIFFNESS, VIRTUAL, DAMPING, FLOOR = 30.0, 45.0, 1.5, 0.004
 """What springs get that are added."""
@@ -196,7 +196,7 @@ def test_pins_stay_where_they_are_whatever_hand_is_steered() -> None:
         parameters=parameters,
         control=control,
         hands=(hand,),
-        pose=np.array([[np.zeros(7)], [[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]]]),
+        pose=0.1 * np.eye(POSE)[:1] * [[[0.0]], [[1.0]]],
     )
     moved = take.controls()[1] - control
     np.testing.assert_allclose(moved[:4], np.tile([[0.1, 0, 0]], (4, 1)), atol=1e-7)

@@ -7,7 +7,7 @@ import pytest
 
 from physhandi.simulation.forces import spring_strains
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.steering import SteeredHand, SteeredSimulation, Take
+from physhandi.simulation.steering import POSE, SteeredHand, SteeredSimulation, Take
 from physhandi.simulation.topology import build_model
 
 SPACING, RATE, GRAVITY = 0.02, 30.0, 9.81
@@ -43,7 +43,7 @@ def sheet() -> Take:
         parameters=PARAMETERS,
         control=control,
         hands=hands,
-        pose=np.zeros((1, 2, 7)),
+        pose=np.zeros((1, 2, POSE)),
     )
 
 
@@ -71,7 +71,7 @@ def test_what_is_let_go_falls_and_the_rest_is_held() -> None:
     assert free.is_regripped
     assert not take.is_regripped
     none = free.let_go(1, free.start, free.pose[0])
-    node = list(replace(none, pose=np.zeros((7, 2, 7))).simulate())[-1][0]
+    node = list(replace(none, pose=np.zeros((7, 2, POSE))).simulate())[-1][0]
     # Semi-implicit Euler falls by g dt² n (n + 1) / 2 in n steps.
     steps = 6 * PARAMETERS.substeps_per_frame
     fallen = GRAVITY * PARAMETERS.dt**2 * steps * (steps + 1) / 2
@@ -86,7 +86,7 @@ def test_a_hand_grips_what_is_near_it_where_it_is() -> None:
         (take.start[0] + rng.normal(scale=0.002, size=(25, 3))).astype(np.float32),
         np.zeros((25, 3), np.float32),
     )
-    pose = np.zeros((2, 7))
+    pose = np.zeros((2, POSE))
     pose[0, :3] = [0.05, 0.045, 0.001]
     grip = take.let_go(0, state, pose).grip(0, state, pose)
     control = grip.control_at(pose)
@@ -145,7 +145,7 @@ def test_pins_stay_where_they_are_beside_points_and_hands() -> None:
     with_pin = replace(take, model=pinned, control=control)
     held = with_pin.hold_point(24, take.start, take.pose[0], "point 1")
     assert pairs(held) - {(24, 3), (19, 3), (23, 3)} == pairs(take) | {(4, 4)}
-    pose = np.full((3, 7), 0.01)
+    pose = np.full((3, POSE), 0.01)
     np.testing.assert_array_equal(held.control_at(pose)[4], take.start[0][4])
     free = held.let_go(0, held.start, pose).let_go(1, held.start, pose)
     assert {control for _, control in pairs(free)} == {3, 4}
@@ -160,8 +160,8 @@ def test_a_point_that_is_held_no_more_leaves_all_as_it_was() -> None:
     take = sheet()
     pose = take.pose[0] + 0.001
     one = take.hold_point(24, take.start, pose, "point 1")
-    two = one.hold_point(12, take.start, np.vstack([pose, np.zeros(7)]), "point 2")
-    last = np.zeros((4, 7))
+    two = one.hold_point(12, take.start, np.vstack([pose, np.zeros(POSE)]), "point 2")
+    last = np.zeros((4, POSE))
     last[:2], last[3] = pose, 0.002
     left = two.without_point(2, take.start, last)
     assert [hand.name for hand in left.hands] == ["right", "left", "point 2"]
@@ -179,15 +179,15 @@ def test_a_point_that_is_held_no_more_leaves_all_as_it_was() -> None:
 def test_the_object_pulls_at_its_hands_with_its_weight() -> None:
     take = replace(sheet(), parameters=PARAMETERS.replace(drag=5.0))
     held = take.hold_point(24, take.start, take.pose[0], "point 1")
-    steered = SteeredSimulation(replace(held, pose=np.zeros((1, 3, 7))))
+    steered = SteeredSimulation(replace(held, pose=np.zeros((1, 3, POSE))))
     for _ in range(150):
-        state = steered.step(np.zeros((3, 7)))
+        state = steered.step(np.zeros((3, POSE)))
     pull = steered.pulls(state)
     # 25 nodes of 1 kg; what stretches it between the corners adds up to nothing.
     np.testing.assert_allclose(pull.sum(axis=0), [0, 0, -25 * GRAVITY], atol=0.5)
     assert (pull[:, 2] < -20).all()
     # A hand that is moving is pulled back by the dashpots, too: where it goes up, harder.
-    up = np.zeros((3, 7))
+    up = np.zeros((3, POSE))
     up[2, 2] = 0.002
     assert steered.pulls(steered.step(up))[2, 2] < pull[2, 2] - 5
 

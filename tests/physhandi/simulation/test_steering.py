@@ -7,8 +7,10 @@ import pytest
 from reference.scenes import as_model, cube_scene
 from reference.spring_mass import simulate
 
+from physhandi.errors import UsageError
+from physhandi.simulation.fingers import BENDS, CURLS, Fingers
 from physhandi.simulation.steering import (
-    CURLS,
+    POSE,
     SteeredHand,
     SteeredSimulation,
     Take,
@@ -20,6 +22,7 @@ from physhandi.simulation.steering import (
 )
 
 FRAMES = 6
+AHEAD = np.array([0.03, 0.0, 0.0])
 
 
 def rotation(axis: int, angle: float) -> np.ndarray:
@@ -37,7 +40,7 @@ def steered_cube(frames: int = FRAMES) -> Take:
     scene = cube_scene()
     model, parameters = as_model(scene)
     way = np.linspace(0, 1, frames)[:, None]
-    pose = np.zeros((frames, 2, 7))
+    pose = np.zeros((frames, 2, POSE))
     pose[:, 0, :3] = way * [0.004, -0.002, 0.006]
     pose[:, 0, 3:6] = way * [0.0, 0.0, 0.3]
     hands = (
@@ -95,7 +98,7 @@ def test_fingers_move_control_nodes_between_the_shapes_that_are_known() -> None:
     shapes[:, 1, 0] += np.float32(0.01) * CURLS.astype(np.float32)
     shapes[:, 2, 0] += np.float32(0.01) * CURLS.astype(np.float32) ** 2
     right = replace(take.hands[0], curls=shapes)
-    pose = np.zeros((4, 2, 7))
+    pose = np.zeros((4, 2, POSE))
     pose[:, 0, 6] = [0.0, 0.3, 1.0, -1.0]
     closing = replace(take, hands=(right, take.hands[1]), pose=pose)
     moved = closing.controls() - take.control
@@ -115,6 +118,77 @@ def test_fingers_move_control_nodes_between_the_shapes_that_are_known() -> None:
     turned = closing.control_at(pose[2])[1] - take.hands[0].wrist
     still = take.control[1] + [0.01, 0, 0] - take.hands[0].wrist
     np.testing.assert_allclose(turned, [-still[1], still[0], still[2]], atol=1e-7)
+
+
+def fingers_of_cube(take: Take) -> Fingers:
+    """Fingers along x, which bend about y and swing about z; node 1 hangs on the first, at its end.
+
+    All five begin at the wrist of the first hand; their joints are 0, 1 and 2 cm from it.
+    """
+    wrist = take.hands[0].wrist
+    origin = np.tile(wrist + 0.01 * np.eye(3)[[0]] * [[0], [1], [2]], (len(CURLS), 5, 1))
+    weight = np.zeros((3, 15))
+    weight[1, 2] = 1.0
+    return Fingers(
+        origin=origin,
+        axis=np.tile([0.0, 1.0, 0.0], (len(CURLS), 15, 1)),
+        swing_axis=np.tile([0.0, 0.0, 1.0], (5, 1)),
+        tip=np.tile(wrist + AHEAD, (len(CURLS), 5, 1)),
+        turn=np.zeros((len(CURLS), 15)),
+        low=np.full(BENDS, -1.0),
+        high=np.full(BENDS, 1.6),
+        weight=weight,
+    )
+
+
+def test_a_finger_takes_its_control_nodes_along_and_the_wrist_takes_all() -> None:
+    take = steered_cube()
+    own = take.control[[0, 1, 2]]
+    shapes = np.repeat(own[None], len(CURLS), axis=0)
+    shapes[:, 1] = take.hands[0].wrist + AHEAD
+    right = replace(take.hands[0], curls=shapes, fingers=fingers_of_cube(take))
+    hands = (right, take.hands[1])
+    pose = np.zeros((3, 2, POSE))
+    pose[1, 0, 7:11] = [0.0, 0.0, np.pi / 2, 0.0]  # The middle joint of the first finger.
+    pose[2] = pose[1]
+    pose[2, 0, 7] = np.pi / 2  # It swings, too, and the hand turns about x and goes up.
+    pose[2, 0, 3:6] = [np.pi / 2, 0.0, 0.0]
+    pose[2, 0, 2] = 0.005
+    take = replace(take, hands=hands, pose=pose)
+    wrist = right.wrist
+    moved = np.stack([take.control_at(its)[1] for its in pose]) - wrist
+    expected = [[0.03, 0, 0], [0.01, 0, -0.02], [0.0, 0.02, 0.01 + 0.005]]
+    np.testing.assert_allclose(moved, expected, atol=1e-7)
+    np.testing.assert_array_equal(take.control_at(pose[1])[[0, 2, 3]], take.control[[0, 2, 3]])
+    np.testing.assert_allclose(right.tip(0, pose[2, 0]) - wrist, expected[2], atol=1e-12)
+    np.testing.assert_allclose(right.tip(1, pose[2, 0]) - wrist, [0.03, 0, 0.005], atol=1e-12)
+
+    # The other way round: from where the tip shall be in the world to the bends.
+    place = np.array([0.01, 0.02, 0.005])
+    for start in (pose[2, 0], np.concatenate([pose[2, 0, :7], np.full(BENDS, 0.3)])):
+        bend = right.follow(0, wrist + place, start)
+        there = np.concatenate([start[:7], bend])
+        np.testing.assert_allclose(right.tip(0, there) - wrist, place, atol=1e-6)
+        np.testing.assert_array_equal(bend[4:], start[11:])
+    with pytest.raises(UsageError, match="left has no fingers that bend"):
+        take.hands[1].follow(0, wrist, pose[0, 1])
+    with pytest.raises(UsageError, match="finite"):
+        right.follow(0, np.full(3, np.nan), pose[0, 0])
+    with pytest.raises(ValueError, match="fingers of right move 2 points; expected one for each"):
+        replace(take, hands=(replace(right, fingers=right.fingers.of_points([0, 1])), hands[1]))
+
+    again = Take.from_tensors(take.to_tensors(), take.parameters)
+    np.testing.assert_array_equal(again.controls(), take.controls())
+    smooth = replace(take, pose=np.repeat(pose[1:2], 5, axis=0)).smoothed(0.1)
+    np.testing.assert_allclose(smooth.pose[:, 0], np.tile(pose[1, 0], (5, 1)), atol=1e-12)
+
+
+def test_a_take_of_before_fingers_bent_one_by_one_opens() -> None:
+    take = steered_cube()
+    tensors = take.to_tensors()
+    old = Take.from_tensors({**tensors, "pose": tensors["pose"][..., :7]}, take.parameters)
+    np.testing.assert_array_equal(old.pose, take.pose)
+    np.testing.assert_array_equal(old.controls(), take.controls())
 
 
 def test_a_take_is_stored_with_every_bit() -> None:
@@ -139,7 +213,7 @@ def test_smoothing_takes_jitter_out_and_leaves_straight_ways_and_the_start() -> 
     np.testing.assert_allclose(take.smoothed(0.1).pose[middle], take.pose[middle], atol=2e-5)
     assert take.smoothed(0.0) is take
     # A hand that turns beyond half a turn does not spin back.
-    pose = np.zeros((60, 2, 7))
+    pose = np.zeros((60, 2, POSE))
     pose[:, 0, 5] = (np.linspace(0, 1.5 * np.pi, 60) + np.pi) % (2 * np.pi) - np.pi
     steps = np.diff(np.unwrap(replace(take, pose=pose).smoothed(0.1).pose[:, 0, 5]))
     assert 0.0 < steps.min() <= steps.max() < 0.1
@@ -148,9 +222,9 @@ def test_smoothing_takes_jitter_out_and_leaves_straight_ways_and_the_start() -> 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"pose": np.full((2, 2, 7), np.nan)}, "pose is not finite at frame 0, hand 0"),
-        ({"pose": np.zeros((2, 1, 7))}, "at least one frame, 2 hands and 7 numbers"),
-        ({"pose": np.zeros((0, 2, 7))}, "at least one frame"),
+        ({"pose": np.full((2, 2, POSE), np.nan)}, "pose is not finite at frame 0, hand 0"),
+        ({"pose": np.zeros((2, 1, POSE))}, "at least one frame, 2 hands and 27 numbers"),
+        ({"pose": np.zeros((0, 2, POSE))}, "at least one frame"),
         ({"control": np.zeros((3, 3), np.float32)}, r"expected \(frames, 4, 3\)"),
     ],
 )
@@ -164,7 +238,7 @@ def test_hands_of_the_same_or_unknown_control_nodes_are_refused() -> None:
     for numbers in ([0, 0], [4], [-1]):
         hand = SteeredHand(name="right", control=np.array(numbers), wrist=np.zeros(3))
         with pytest.raises(ValueError, match="must name different control nodes"):
-            replace(take, hands=(hand,), pose=np.zeros((1, 1, 7)))
+            replace(take, hands=(hand,), pose=np.zeros((1, 1, POSE)))
     with pytest.raises(ValueError, match="frames 3 to 6 are not among the 6"):
         take.part(3, 6, next(take.simulate()))
     tensors = take.to_tensors()
@@ -178,7 +252,7 @@ def test_rotations_follow_one_another_about_the_axes_of_the_world() -> None:
     both = turn_on(np.array([quarter, 0.0, 0.0]), np.array([0.0, 0.0, quarter]))
     expected = rotation(2, quarter) @ rotation(0, quarter)
     hand = SteeredHand(name="right", control=np.array([0]), wrist=np.zeros(3))
-    moved = hand.moved(np.eye(3), np.concatenate([np.zeros(3), both]))
+    moved = hand.moved(np.eye(3), np.concatenate([np.zeros(3), both, np.zeros(POSE - 6)]))
     np.testing.assert_allclose(moved, expected.T, atol=1e-12)
     start = np.array([0.3, -0.2, 0.1])
     np.testing.assert_allclose(turn_on(start, turn_between(start, both)), both, atol=1e-12)
