@@ -1,13 +1,13 @@
 """Runs torch on one thread, where several are slower and give other bits on another machine."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 import torch
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def one_thread() -> Generator[None]:
     """Run torch on one thread.
 
     The tensors of a fit are small: threads wait for each other longer than they work, and on a

@@ -91,7 +91,7 @@ def test_at_most_twenty_types_are_ignored_and_each_says_why() -> None:
         f"{place(path)}:{number}: {line.strip()}"
         for path in SOURCE_FILES
         for number, line in enumerate(path.read_text().splitlines(), 1)
-        if re.search(r"#\s*(type|pyright):\s*ignore|cast\(Any", line)
+        if re.search(r"#\s*(type|pyrefly):\s*ignore|cast\(Any", line)
     ]
     assert len(lines) <= 20, "\n".join(lines)
     assert all(

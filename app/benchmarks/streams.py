@@ -212,7 +212,7 @@ def _receive(
             screen.play(on=True)
             everyone.wait(PATIENCE_S)
             _count(client, seconds, mine)
-    except (OSError, TimeoutError, threading.BrokenBarrierError, ValueError) as error:
+    except (OSError, threading.BrokenBarrierError, ValueError) as error:
         mine.error = str(error) or type(error).__name__
         everyone.abort()
 

@@ -127,7 +127,7 @@ def measure_viewer(
     }
 
 
-def compare_with_goals(found: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def compare_with_goals(found: Mapping[Part, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Hold what was measured against the goals.
 
     Args:

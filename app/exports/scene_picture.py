@@ -100,7 +100,7 @@ def _all_splats(groups: Listing[tuple[Any, ndarray, ndarray]]) -> Splats:
 def _visible_nodes(server: viser.ViserServer) -> Iterator[tuple[Any, ndarray, ndarray]]:
     """List the nodes that are shown, with their rotations and positions in the world."""
     scene: Any = server.scene
-    nodes: _Nodes = scene._handle_from_node_name
+    nodes: _Nodes = scene._handle_from_node_name  # noqa: SLF001  # no other way
     for name, node in nodes.items():
         parts = name.strip("/").split("/")
         paths = ["/" + "/".join(parts[: count + 1]) for count in range(len(parts))]

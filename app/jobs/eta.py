@@ -375,7 +375,9 @@ class Forecast:
             expected = expect(
                 fits, settings, self._own_machine(), work_of(config, Extent.of(sequences))
             )
-        return expected and {"seconds": float(round(expected.total_s)), "basis": expected.basis}
+        if expected is None:
+            return None
+        return {"seconds": float(round(expected.total_s)), "basis": expected.basis}
 
     def _left_of(self, run: Run) -> float | None:
         """Estimate a run that has a place, also if it has not begun [s]."""
@@ -383,7 +385,7 @@ class Forecast:
         if running is not None:
             return float(running["left_s"])
         expected = self._expectation(run)
-        return expected and expected.total_s
+        return None if expected is None else expected.total_s
 
     def _expectation(self, run: Run, machine: tuple[Any, ...] | None = None) -> Expectation | None:
         """Expect the stages of a run; the same until the run folders are looked at again."""

@@ -131,8 +131,10 @@ class Previews:
             NotFoundError: If there is no such run or sequence.
         """
         source = self._source(kind, item_id)
-        path = source and self._path(source, MOVING if is_moving else STILL)
-        return path if path is not None and path.is_file() else None
+        if source is None:
+            return None
+        path = self._path(source, MOVING if is_moving else STILL)
+        return path if path.is_file() else None
 
     def _source(self, kind: PreviewKind, item_id: str) -> _Source | None:
         if kind == "sequence":

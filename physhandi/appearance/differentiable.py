@@ -1,6 +1,6 @@
 """Splats as PyTorch sees them: a picture through which a loss can be differentiated."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,6 +13,8 @@ from physhandi.appearance.rasterise import SplatDrawing
 from physhandi.data.camera import PinholeCamera
 from physhandi.devices import start_warp
 
+_shared: Callable[..., Any] = wp.from_torch
+"""Warp's array of a tensor's memory; without more options it never is a bare C structure."""
 _Picture = tuple[
     Float[Tensor, "row column 3"], Float[Tensor, "row column"], Float[Tensor, "row column"]
 ]
@@ -59,31 +61,31 @@ class _Drawing(torch.autograd.Function):
     """Connects the rasteriser to PyTorch."""
 
     @staticmethod
-    def forward(ctx: Any, camera: PinholeCamera, *splats: Tensor):
+    def forward(ctx: Any, camera: PinholeCamera, *splats: Tensor) -> tuple[Tensor, ...]:
         center, scale, color, opacity = (value.detach().contiguous() for value in splats)
         with _on_device_of(center):
             drawing = SplatDrawing(
                 camera,
-                center=wp.from_torch(center, dtype=wp.vec3),
-                scale=wp.from_torch(scale),
-                color=wp.from_torch(color, dtype=wp.vec3),
-                opacity=wp.from_torch(opacity),
+                center=_shared(center, dtype=wp.vec3),
+                scale=_shared(scale),
+                color=_shared(color, dtype=wp.vec3),
+                opacity=_shared(opacity),
             )
             ctx.drawing = drawing
             return tuple(wp.to_torch(v) for v in (drawing.color, drawing.alpha, drawing.depth))
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor):
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         color, alpha, depth = (value.contiguous() for value in grad_outputs)
         with _on_device_of(color):
             slopes = ctx.drawing.slopes(
-                wp.from_torch(color, dtype=wp.vec3), wp.from_torch(alpha), wp.from_torch(depth)
+                _shared(color, dtype=wp.vec3), _shared(alpha), _shared(depth)
             )
             return None, *(wp.to_torch(value) for value in slopes)
 
 
 @contextmanager
-def _on_device_of(tensor: Tensor) -> Iterator[None]:
+def _on_device_of(tensor: Tensor) -> Generator[None]:
     """Let Warp work where a tensor is, and on a GPU in PyTorch's order of things."""
     start_warp()
     if not tensor.is_cuda:

@@ -36,7 +36,7 @@ def draw_splats_by_gsplat(
         raise ValueError("the camera must have neither lens distortion nor skew for gsplat")
     if not center.is_cuda:
         raise ValueError(f"gsplat draws on CUDA alone, but the splats are on {center.device}")
-    from gsplat import (  # pyright: ignore[reportMissingImports]  # an extra
+    from gsplat import (  # pyrefly: ignore[missing-import]  # an extra
         rasterization,
     )
 

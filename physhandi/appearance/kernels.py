@@ -12,11 +12,6 @@ followed (`DARK`).
 """
 
 # Warp's types are no classes to a type checker.
-# pyright: reportUntypedFunctionDecorator=false, reportGeneralTypeIssues=false
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
-# pyright: reportCallIssue=false, reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-# pyright: reportReturnType=false, reportAssignmentType=false
-
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})

@@ -272,7 +272,8 @@ class _StraightView(View):
     def __init__(self, recorded: View) -> None:
         camera = recorded.camera
         straight = replace(camera, distortion=np.zeros(5))
-        super().__init__(recorded.folder, recorded._sequence, straight, recorded.frame_count)
+        source = recorded._sequence  # noqa: SLF001  # of its own class
+        super().__init__(recorded.folder, source, straight, recorded.frame_count)
         self._recorded = camera
         size = (camera.width, camera.height)
         self._maps = cv2.initUndistortRectifyMap(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -114,7 +113,7 @@ class HandMotion:
             raise ValueError(f"hand motion's 'model' must be 0 or 1, not {model}")
         return cls(
             model=_MODELS[int(model)],
-            side=cast("HandSide", _SIDES[int(tensors["side"])]),
+            side=_SIDES[int(tensors["side"])],
             shape=tensors["shape"],
             articulation=tensors["articulation"],
             wrist_rotation=tensors["wrist_rotation"],

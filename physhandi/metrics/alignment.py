@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+from scipy.spatial import KDTree
 
 CARRIERS = 8
 """Nodes whose common rigid motion carries a point."""

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+from scipy.spatial import KDTree
 
 from physhandi.metrics.alignment import CARRIERS, carried_points, rigid_transform
 

@@ -340,7 +340,9 @@ def tables_of(rows: Sequence[SuiteRow]) -> dict[str, list[Column]]:
     }
 
 
-def _both(figures: Sequence[tuple[str, str, float, int]], after: str = "", before: str = ""):
+def _both(
+    figures: Sequence[tuple[str, str, float, int]], after: str = "", before: str = ""
+) -> list[Column]:
     return [
         column
         for split, short in _SPLITS.items()

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+from scipy.spatial import KDTree
 
 REFERENCE_RATIO = 3.0
 """Connection radius over resolution that peridynamics recommends."""

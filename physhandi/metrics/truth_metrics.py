@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+from scipy.spatial import KDTree
 
 from physhandi.data.truth import Truth
 from physhandi.errors import SequenceError

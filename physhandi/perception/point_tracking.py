@@ -115,7 +115,7 @@ class _Tracker:
         self._view, self._mask = view, mask
         self._paths: list[_Path] = []
         self._alive: list[int] = []
-        self._gray = np.zeros((0, 0), dtype=np.uint8)
+        self._gray: ndarray = np.zeros((0, 0), dtype=np.uint8)
         self._depth = np.zeros(0)
         self._pair = np.zeros((0, 2), dtype=np.int64)
         self._rest = np.zeros(0)

@@ -419,7 +419,7 @@ class _Colors:
 
     def inherit(self, other: "_Colors") -> None:
         """Take over what another view has seen."""
-        self._count += other._count
+        self._count += other._count  # noqa: SLF001  # of its own class
         self._logarithm = None
 
     def fade(self, most: float) -> None:

@@ -322,8 +322,8 @@ def _work(channel: Channel) -> None:
     sys.dont_write_bytecode = True  # Their folder stays as it is.
     import torch
 
-    torch.hub.load_state_dict_from_url = _refuse_download
-    torch.hub.download_url_to_file = _refuse_download
+    for loading in ("load_state_dict_from_url", "download_url_to_file"):
+        setattr(torch.hub, loading, _refuse_download)
     sequence = Sequence.load(Path(recording))
     views = {view.name: view for view in sequence.views}
     try:

@@ -8,11 +8,6 @@ same bits on all processors.
 """
 
 # Warp's types are no classes to a type checker.
-# pyright: reportUntypedFunctionDecorator=false, reportGeneralTypeIssues=false
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
-# pyright: reportCallIssue=false, reportAttributeAccessIssue=false, reportInvalidTypeForm=false
-# pyright: reportReturnType=false, reportAssignmentType=false
-
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

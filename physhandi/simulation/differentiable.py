@@ -5,7 +5,7 @@ allows (`engines.tape.Trajectory`); the backward pass simulates the other frames
 gradients are the same bits run after run, however many frames are stored.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from typing import Any
@@ -140,7 +140,7 @@ class _Rollout(torch.autograd.Function):
         trajectory: Trajectory | None,
         frames: tuple[int, int | None],
         *tensors: Tensor,
-    ):
+    ) -> tuple[Tensor, Tensor]:
         with bridge.stream():
             position, velocity = bridge.forward(tensors, trajectory, frames[0])
         ctx.bridge, ctx.trajectory, ctx.frames = bridge, trajectory, frames
@@ -148,7 +148,7 @@ class _Rollout(torch.autograd.Function):
         return position, velocity
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor):
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Any, ...]:
         *tensors, position, velocity = ctx.saved_tensors
         states = position, velocity
         first_frame, window = ctx.frames
@@ -198,7 +198,7 @@ class _DifferentiableSimulator:
         return Trajectory(self.adjoint, self.simulator.device, len(tensors[0]) - 1, memory)
 
     @contextmanager
-    def stream(self) -> Iterator[None]:
+    def stream(self) -> Generator[None]:
         """Run PyTorch on Warp's stream, synchronised with its own before and after."""
         if not self.simulator.device.is_cuda:
             yield

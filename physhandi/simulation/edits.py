@@ -7,7 +7,7 @@ spring that the present topology does not have is passed over.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -278,7 +278,8 @@ def _applied(
 def _scaled(model: SpringMassModel, edit: ScaleMaterial) -> SpringMassModel:
     factor = np.where(_named(model, edit), edit.factor, 1.0)
     value = np.asarray(getattr(model, edit.quantity), np.float64)
-    return replace(model, **{edit.quantity: (factor * value).astype(np.float32)})
+    scaled: dict[str, Any] = {edit.quantity: (factor * value).astype(np.float32)}
+    return replace(model, **scaled)
 
 
 def _joined(
@@ -439,7 +440,7 @@ def _tied(
 
 def _with_springs(model: SpringMassModel, place: int, new: dict[str, ndarray]) -> SpringMassModel:
     """Put springs into the list of a model; virtual ones, at its end, have the field `attached`."""
-    merged: dict[str, ndarray] = {}
+    merged: dict[str, Any] = {}
     for name, values in new.items():
         old: ndarray = getattr(model, name)
         at = len(old) if name == "attached" else place

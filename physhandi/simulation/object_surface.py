@@ -291,7 +291,7 @@ def _lay_thin_tube(
     They are on its middle, and an average over neighbors would cut every bend. None if they are no
     chain of such nodes.
     """
-    from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # none
+    from scipy.interpolate import CubicSpline
 
     tree = minimum_spanning_tree(squareform(pdist(point)))
     joints = np.bincount(np.concatenate(tree.nonzero()), minlength=len(point))

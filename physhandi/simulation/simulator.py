@@ -127,9 +127,10 @@ class Simulator:
                     f"{name} has shape {np.shape(value)}; expected one value for each "
                     f"of the {len(self.model.rest_length)} springs."
                 )
-            getattr(self, name).assign(np.asarray(value, dtype=np.float32))
+            changed: dict[str, Any] = {name: np.asarray(value, dtype=np.float32)}
+            getattr(self, name).assign(changed[name])
             self._held = None
-            self.model = replace(self.model, **{name: np.asarray(value, dtype=np.float32)})
+            self.model = replace(self.model, **changed)
 
     def set_rod(self, rod: Rod) -> None:
         """Change how a rope bends: its stiffness, its damping and its natural curvature."""

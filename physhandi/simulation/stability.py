@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -250,7 +251,7 @@ class _SpringOperator:
 
     def of_mode(self, mode: ndarray) -> tuple[float, float]:
         """Return stiffness and damping of a mode of length 1."""
-        squared, own = (self.stretch @ mode) ** 2, mode**2
+        squared, own = np.square(self.stretch @ mode), np.square(mode)
         values = (
             _dot(squared, self.rate[name]) + _dot(own, self.anchor[name])
             for name in ("stiffness", "damping")
@@ -303,8 +304,12 @@ def _stiffest_mode(springs: _SpringOperator, step: float, start: ndarray) -> nda
         beside.append(rest)
         basis.append(force / rest)
     last = len(diagonal) - 1
-    _, part = eigh_tridiagonal(diagonal, beside[:last], select="i", select_range=(last, last))
-    mode = sum((part[index, 0] * basis[index] for index in range(last + 1)), np.zeros(len(start)))
+    chosen = {"select": "i", "select_range": (last, last)}
+    found: Any = eigh_tridiagonal(diagonal, beside[:last], **chosen)
+    part = found[1]
+    mode = np.zeros(len(start))
+    for index in range(last + 1):
+        mode += part[index, 0] * basis[index]
     return mode / _length(mode)
 
 

@@ -375,7 +375,7 @@ class Take:
         length = np.linalg.norm(position[springs[:, 0]] - control[own], axis=1)
         every = np.ones(len(ends), bool)
         held = np.concatenate([pose, np.zeros((1, POSE))])
-        return more._rejoined(every, state, held, (springs, length))
+        return more._rejoined(every, state, held, (springs, length))  # noqa: SLF001  # its own class
 
     def without_point(
         self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]

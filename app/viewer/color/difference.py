@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+from scipy.spatial import KDTree
 
 from physhandi.object_rollout import ObjectRollout
 from physhandi.triangles import segment_distance, triangle_distance

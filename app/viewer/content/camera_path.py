@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]  # none
+from scipy.spatial.transform import Rotation
 
 from app.viewer.content.session_state import KeyFrame, Pose
 from physhandi.data.files import named_fields

@@ -4,6 +4,7 @@ import html
 import math
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -361,7 +362,7 @@ class EditPanel:
             self._callbacks.clear()
             if self._is_on and tool == _RECTANGLE:
                 for modifier, way in _MODIFIERS.items():
-                    callback = self._guard(lambda event, way=way: self._take_rectangle(event, way))
+                    callback = self._guard(partial(self._take_rectangle, way=way))
                     self._callbacks.append(callback)
                     scene.on_rect_select(modifier=modifier)(callback)
             draws = self._is_on and tool != _RECTANGLE

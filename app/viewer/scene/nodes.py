@@ -275,7 +275,7 @@ class _MovedSplats:
     """The nodes of one object's groups of splats."""
 
     def __init__(self, scene: viser.SceneApi, name: str, groups: SplatGroups) -> None:
-        self._queue: Any = scene._queue_scene_message  # pyright: ignore[reportPrivateUsage]  # see `move`
+        self._queue: Any = scene._queue_scene_message  # noqa: SLF001  # see `move`
         self._groups = groups
         splats = groups.splats
         # Squares of a millimetre would have three digits in the 16-bit floats that are sent.
@@ -307,7 +307,7 @@ class _MovedSplats:
         moved = np.flatnonzero(~(np.abs(pose - self._pose) <= self._least).all(axis=1))
         for group in moved:
             its, at = self._nodes[group], pose[group]
-            its._impl.wxyz[:], its._impl.position[:] = at[:4], at[4:]
+            its._impl.wxyz[:], its._impl.position[:] = at[:4], at[4:]  # noqa: SLF001  # see `move`
             self._queue(messages.SetOrientationMessage(its.name, tuple(at[:4].tolist())))
             self._queue(messages.SetPositionMessage(its.name, tuple(at[4:].tolist())))
         self._pose[moved] = pose[moved]

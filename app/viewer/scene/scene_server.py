@@ -28,7 +28,7 @@ def start_viser(label: str) -> viser.ViserServer:
     rich.get_console().quiet = True  # viser would print its loopback address, which misleads.
     server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
     # Any client could ask for a public tunnel with this message.
-    infrastructure: Any = server._websock_server  # pyright: ignore[reportPrivateUsage]  # no other way
+    infrastructure: Any = server._websock_server  # noqa: SLF001  # no other way
     infrastructure.unregister_handler(messages.ShareUrlRequest)
     server.scene.configure_environment_map(_SURROUNDINGS, environment_intensity=_BRIGHTNESS)
     return server

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from numpy import ndarray
-from scipy.cluster import vq as _vq  # pyright: ignore[reportMissingTypeStubs]  # it has none
-from scipy.sparse import csr_array  # pyright: ignore[reportMissingTypeStubs]  # none
-from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]  # none
+from scipy.cluster import vq as _vq
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
 
 from physhandi.appearance.binding import SplatBinding
 from physhandi.appearance.splats import Splats

@@ -349,8 +349,10 @@ class SteerPanel:
         self._frame = playback.frame
         rollout, frame = self._rollout_at(self._frame)
         skins = self._skins()
-        surfaces = {hand.side: self._surface(hand, skins) for hand in self._content.hands}
-        wrists = {
+        surfaces: dict[str, HandSurface] = {
+            hand.side: self._surface(hand, skins) for hand in self._content.hands
+        }
+        wrists: dict[str, ndarray] = {
             hand.side: np.array(hand.joint[min(self._frame, len(hand.joint) - 1)][0], np.float64)
             for hand in self._content.hands
             if hand.joint is not None

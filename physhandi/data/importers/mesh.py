@@ -49,7 +49,7 @@ def read_mesh(path: Path | str) -> Mesh:
 
     try:
         # The whole scene, because transforms of nodes say where its parts are.
-        scene: Any = trimesh.load_scene(path)  # pyright: ignore[reportUnknownMemberType]  # its types
+        scene: Any = trimesh.load_scene(path)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
         colors = [_colors(part) for part in parts]
     except Exception as error:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # it has none
+from scipy.interpolate import CubicSpline
 
 from physhandi.data.files import read_array
 from physhandi.data.length_unit import doubt_extent, doubt_position

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
-from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+from scipy.spatial import KDTree
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.fitting.object_problem import TRACK_CARRIERS, attach

@@ -220,7 +220,7 @@ def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]
     Raises:
         UsageError: If a setting is unknown or out of bounds.
     """
-    own = pipeline.settings_of(method.profile, {})
+    own: Any = pipeline.settings_of(method.profile, {})
     # What is compared is what methods make of the same hands.
     hands = pipeline.settings_of("default", {})["hand"]
     same_hands = {f"hand.{name}": value for name, value in hands.items()}

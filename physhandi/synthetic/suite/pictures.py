@@ -14,6 +14,7 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_meta import Side
 from physhandi.data.truth import read_truth
 from physhandi.errors import MissingInputError
 from physhandi.metrics.topology import resolution
@@ -144,7 +145,7 @@ def _camera(camera: PinholeCamera, point: Float[ndarray, "point 3"]) -> PinholeC
     return PinholeCamera(K=K, T_world_camera=camera.T_world_camera, width=WIDTH, height=HEIGHT)
 
 
-def _hands(vertex: Mapping[str, ndarray], face: Mapping[str, ndarray], frame: int) -> list[Shape]:
+def _hands(vertex: Mapping[Side, ndarray], face: Mapping[Side, ndarray], frame: int) -> list[Shape]:
     return [
         Surface(vertex=vertex[side][frame], faces=face[side], color=_HAND, shading=0.6)
         for side in vertex

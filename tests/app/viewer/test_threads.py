@@ -207,7 +207,7 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
     with watched(sessions) as (session, _):
         assert session._object is not None
         panel, rollouts = session._object.panel, SlowRollouts(session)
-        panel._rollouts = rollouts  # pyright: ignore[reportAttributeAccessIssue]
+        panel._rollouts = rollouts
         controls = {knob.field: (knob, control) for knob, control in panel._sliders._controls}
         knob, control = controls["drag"]
         control.handle._impl.value = 7.0
