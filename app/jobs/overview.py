@@ -1,13 +1,16 @@
 """The machine, its queue and the program, as plain data."""
 
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Any
 
-from app.jobs.catalog import Catalog
+from app.jobs.catalog import Catalog, UnknownRunError
 from app.jobs.machine import Machine
 from app.jobs.scheduler import Scheduler
 from app.jobs.views import describe_run
 from app.settings import ServerSettings
 from physhandi.data.environment import describe_environment
+from physhandi.run import Run
 
 
 class Overview:
@@ -54,17 +57,20 @@ class Overview:
             and ``waiting`` (see `describe_run`), the running ones with ``load`` (see
             `Machine.of_run`).
         """
-        running: list[dict[str, Any]] = []
-        for run in self._scheduler.at_work():
-            described = describe_run(self._catalog.run_item(run.id), self._scheduler)
-            running.append(described | {"load": self._machine.of_run(run.folder)})
-        waiting = [
-            describe_run(self._catalog.run_item(run.id), self._scheduler)
-            for run in self._scheduler.in_line()
+        running = [
+            described | {"load": self._machine.of_run(run.folder)}
+            for run, described in self._described(self._scheduler.at_work())
         ]
+        waiting = [described for _, described in self._described(self._scheduler.in_line())]
         return {
             "machine": self._machine.load(),
             "slots": {"used": len(running), "total": self._scheduler.slots},
             "running": running,
             "waiting": waiting,
         }
+
+    def _described(self, runs: Iterable[Run]) -> Iterator[tuple[Run, dict[str, Any]]]:
+        """Describe runs, but for those that were deleted since the queue saw them last."""
+        for run in runs:
+            with suppress(UnknownRunError):
+                yield run, describe_run(self._catalog.run_item(run.id), self._scheduler)

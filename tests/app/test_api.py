@@ -274,3 +274,18 @@ def test_too_many_live_scenes_are_refused(world: World) -> None:
         assert "2 live sessions are open" in error_of(full)["message"]
     finally:
         world.sessions.shutdown()
+
+
+def test_a_run_that_is_deleted_before_the_queue_looks_again_is_left_out(world: World) -> None:
+    gone, kept = (world.scheduler.launch(["sheet"], "quick", name) for name in ("gone", "kept"))
+    with world.scheduler._lock:
+        world.scheduler._look_around()
+    client = world.script()
+
+    def waiting() -> list[str]:
+        return [run["id"] for run in client.get("/api/v1/system").json()["waiting"]]
+
+    assert waiting() == [gone.id, kept.id]
+    gone.delete()
+    assert waiting() == [kept.id]
+    assert world.browser().get("/system").status_code == 200
