@@ -1,4 +1,7 @@
-"""A worker for tests of the queue: the run's name tells what it does."""
+"""A worker for tests of the queue: the run's name tells what it does.
+
+One whose name begins with ``real`` is fitted, as by the worker of the server.
+"""
 
 import json
 import os
@@ -7,6 +10,7 @@ import subprocess
 import sys
 import time
 
+from app.jobs.worker import fill_run
 from physhandi.child import Channel, run_child
 from physhandi.data.attempt import Attempt
 from physhandi.errors import MissingInputError
@@ -132,6 +136,9 @@ def work(channel: Channel) -> None:
     channel.beat(float(channel.arguments[2]))
     if run.name == "silent":
         raise SystemExit(5)
+    if run.name.startswith("real "):
+        fill_run(run.folder, channel.arguments[1], channel.step)
+        return
     with run.begin_attempt() as attempt:
         BEHAVIOURS[run.name.split()[0]](run, attempt)
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
 import psutil
@@ -65,7 +65,7 @@ class Served:
         self._host = f"{address.hostname}:{address.port}"
         self._headers = {"Authorization": f"Bearer {parse_qs(address.query)['token'][0]}"}
 
-    def __enter__(self) -> "Served":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import msgspec.msgpack
 import numpy as np
@@ -84,7 +84,7 @@ class ViewerClient:
         self.bytes_received = 0
         self.moment = 0.0
 
-    def __enter__(self) -> "ViewerClient":
+    def __enter__(self) -> Self:
         self.tell_camera()
         return self
 

@@ -18,6 +18,7 @@ two in their long form and prints their counts, ``--count 5`` with that count.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from pkgutil import iter_modules
 
@@ -41,6 +42,10 @@ class Case:
     """How often among the other tests; 0 for not at all."""
     run: Callable[[int, Path], Report]
     """Does it; given the count and an empty folder."""
+    last: Callable[[float, Path], Report] | None = None
+    """Does it for so long [s], in the long form, and says how often that was."""
+    minutes: float = 0.0
+    """How long that is in the long form [min]."""
 
 
 def all_cases() -> dict[str, Case]:
@@ -52,7 +57,13 @@ def all_cases() -> dict[str, Case]:
         for name, case in import_module(f"{__name__}.{module.name}").CASES.items():
             assert name not in found, f"two cases are named {name}"
             found[name] = case
-    return dict(sorted(found.items(), key=lambda item: (len(item[0]), item[0])))
+    return dict(sorted(found.items(), key=lambda item: in_order(item[0])))
+
+
+def in_order(name: str) -> tuple[int, str]:
+    """Sort names of cases by their numbers."""
+    digits = "".join(takewhile(str.isdigit, name[1:]))
+    return int(digits), name
 
 
 def faults_of(case_count: int, report: Report) -> list[str]:

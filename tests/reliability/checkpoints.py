@@ -16,12 +16,12 @@ from waiting import until
 from app.jobs.worker import fill_run
 from physhandi import pipeline
 from physhandi.data import checkpoint
-from physhandi.data.environment import ENVIRONMENT
-from physhandi.data.run_folder import artefacts, read_events
+from physhandi.data.run_folder import read_events
 from physhandi.errors import CancelledError
 from physhandi.fitting.config import PipelineConfig, load_profile
 from physhandi.run import Run
 from reliability import Case, Report
+from reliability.jobs import results_of
 
 
 def sheet_fit(folder: Path) -> Callable[[str], Run]:
@@ -52,12 +52,6 @@ def _new_run(folder: Path, sequence: Path, config: PipelineConfig) -> Run:
     )
 
 
-def _results(run: Run) -> dict[str, bytes]:
-    """Read all published files, but the one that tells when and where it was made."""
-    run.verify()
-    return {rel: path.read_bytes() for rel, path in artefacts(run.out) if rel != ENVIRONMENT}
-
-
 def _always_written() -> None:
     """Let every state be written in this process."""
     checkpoint.CHECKPOINT_INTERVAL_S, checkpoint.CHECKPOINT_SHARE = 0.0, np.inf
@@ -74,7 +68,7 @@ def resume(count: int, folder: Path) -> Report:
         for make in (sheet_fit(folder), hand_fit(folder)):
             whole, heard = make(f"whole{len(kinds)}"), Stopper()
             pipeline.run_job(whole, heard)
-            kinds.append((make, _results(whole), len(heard.reports)))
+            kinds.append((make, results_of(whole), len(heard.reports)))
         done = runs = corrupt = lost = redone = 0
         while done < count:
             new_run, expected, reports = kinds[runs % 2]
@@ -87,7 +81,7 @@ def resume(count: int, folder: Path) -> Report:
                 told += sum("Resumed" not in report[3] for report in stopper.reports)
             runs += 1
             lost += run.state != "succeeded"
-            corrupt += _results(run) != expected
+            corrupt += results_of(run) != expected
             redone += told - reports
     return {"done": done, "runs": runs, "lost": lost, "corrupt": corrupt, "redone": redone}
 
@@ -122,7 +116,7 @@ def kill_workers(count: int, folder: Path) -> Report:
 
     whole = new_run("whole")
     go_on(whole, None)
-    expected = _results(whole)
+    expected = results_of(whole)
     done = runs = corrupt = lost = 0
     while done < count:
         run = new_run(f"run{runs}")
@@ -130,7 +124,7 @@ def kill_workers(count: int, folder: Path) -> Report:
             done += go_on(run, int(chance.integers(1, 12)) if done < count else None)
         runs += 1
         lost += run.state != "succeeded"
-        corrupt += _results(run) != expected
+        corrupt += results_of(run) != expected
     return {"done": done, "runs": runs, "lost": lost, "corrupt": corrupt}
 
 

@@ -224,7 +224,7 @@ def _start(deed: str, folder: Path) -> "subprocess.Popen[str]":
 CASES = {
     "R10": Case(
         "A file of a run or sequence is damaged, and every page and answer is asked for",
-        40,
+        120,
         4,
         corrupt_inputs,
     ),

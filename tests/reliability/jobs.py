@@ -1,5 +1,6 @@
 """The queue and its processes."""
 
+import itertools
 import os
 import signal
 import time
@@ -12,8 +13,10 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 from psutil import _pslinux
 from sheet_sequence import write_sheet
+from suite_world import SETTINGS
 from waiting import until
 
 from app.jobs import scheduler as scheduler_module
@@ -22,10 +25,15 @@ from app.jobs.launch_keys import KeyedRequest
 from app.jobs.processes import end_processes, processes_of, supervisor_of
 from app.jobs.scheduler import ENDED, Scheduler
 from app.settings import ServerSettings
+from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.lease import live_holder
+from physhandi.data.run_folder import artefacts, read_events
 from physhandi.errors import RunError
 from physhandi.run import Run
 from reliability import Case, Report
+
+REAL = {**SETTINGS, "object_.search.generations": 4, "object_.first_order.iterations": 6}
+"""Effort of a real fit: so much that it can be hit in all of its stages."""
 
 
 @contextmanager
@@ -101,7 +109,11 @@ def state_of(scheduler: Scheduler, run: Run) -> str:
 
 
 def disturb(count: int, folder: Path, deed: Callable[[Run], None], **settings: Any) -> Report:
-    """Do something to a fit in the middle of each of its attempts, then let it end."""
+    """Do something to a fit in the middle of each of its attempts, then let it end.
+
+    A tenth of it is done to real fits, which have to end with the bits of an undisturbed one.
+    """
+    real = count // 10
     with queue_in(folder, **settings) as scheduler:
         run = scheduler.launch(["sheet"], "quick", "wait")
         resumed = 0
@@ -111,26 +123,92 @@ def disturb(count: int, folder: Path, deed: Callable[[Run], None], **settings: A
             is_begun = (told.get("attempt"), told.get("stage")) == (number, "second")
             return is_begun and live_holder(run.folder) is not None
 
-        for number in range(1, count + 1):
+        for number in range(1, count - real + 1):
             until(partial(is_at_work_for_the_time, number), lambda: run.progress)
             deed(run)
             if number % 2 == 0:
                 until(lambda: state_of(scheduler, run) == "failed")
                 scheduler.resume(run.id)
                 resumed += 1
-        until(partial(is_at_work_for_the_time, count + 1), lambda: run.progress)
+        until(partial(is_at_work_for_the_time, count - real + 1), lambda: run.progress)
         (run.folder / "go").touch()
         until(lambda: state_of(scheduler, run) in ENDED)
         until(lambda: supervisor_of(run.folder) is None)
-        return {
-            "done": count,
-            "started again": count - resumed,
-            "resumed": resumed,
-            "lost": run.state != "succeeded",
-            "corrupt": is_damaged(run) or run.json("first.json") != {"attempt": 1},
-            "published twice": len(list(run.folder.glob("attempts/*/MANIFEST.json"))) - 1,
-            "orphans": len(list(processes_of(run.folder))),
-        }
+        counts = Counter(
+            {
+                "done": count - real,
+                "started again": count - real - resumed,
+                "resumed": resumed,
+                "lost": int(run.state != "succeeded"),
+                "corrupt": int(is_damaged(run) or run.json("first.json") != {"attempt": 1}),
+                "published twice": len(list(run.folder.glob("attempts/*/MANIFEST.json"))) - 1,
+                "orphans": len(list(processes_of(run.folder))),
+            }
+        )
+        if real:
+            counts.update(_disturb_fits(scheduler, real, deed))
+        return counts
+
+
+def _disturb_fits(scheduler: Scheduler, count: int, deed: Callable[[Run], None]) -> Counter[str]:
+    """Do something to real fits after random reports, until they are through."""
+    chance = np.random.default_rng(count)
+    counts: Counter[str] = Counter()
+
+    def launch(number: int) -> Run:
+        return scheduler.launch(["sheet"], "quick", f"real {number}", overrides=REAL)
+
+    whole = launch(0)
+    until(lambda: state_of(scheduler, whole) in ENDED)
+    expected = results_of(whole)
+    for number in itertools.count(1):
+        if counts["done"] == count:
+            return counts
+        run = launch(number)
+        while _await_reports(scheduler, run, int(chance.integers(1, 8))) not in ENDED:
+            if counts["done"] == count:
+                until(lambda run=run: state_of(scheduler, run) in ENDED)
+                break
+            attempt = run.attempt or 0
+            deed(run)
+            # As long as nobody has noticed, it counts as running.
+            until(lambda run=run, n=attempt: _has_gone_on(scheduler, run, n))
+            if (run.folder / "attempts" / str(attempt) / "MANIFEST.json").exists():
+                break  # It had published already, so that it was not hit.
+            is_failed = state_of(scheduler, run) == "failed"
+            if is_failed:
+                scheduler.resume(run.id)
+            counts.update(("done", "of real fits", "resumed" if is_failed else "started again"))
+        until(lambda run=run: supervisor_of(run.folder) is None)
+        counts["lost"] += run.state != "succeeded"
+        counts["corrupt"] += run.is_published and results_of(run) != expected
+        counts["published twice"] += len(list(run.folder.glob("attempts/*/MANIFEST.json"))) - 1
+        counts["orphans"] += len(list(processes_of(run.folder)))
+    raise AssertionError("numbers have no end")
+
+
+def _await_reports(scheduler: Scheduler, run: Run, count: int) -> str:
+    """Wait until a fit has told more, or has ended; gives its state."""
+    known = len(read_events(run.folder)[0])
+
+    def has_told() -> bool:
+        if state_of(scheduler, run) in ENDED:
+            return True
+        told = len(read_events(run.folder)[0]) - known
+        return told >= count and None not in (live_holder(run.folder), supervisor_of(run.folder))
+
+    until(has_told)
+    return state_of(scheduler, run)
+
+
+def _has_gone_on(scheduler: Scheduler, run: Run, attempt: int) -> bool:
+    return (run.attempt or 0) > attempt or state_of(scheduler, run) in ENDED
+
+
+def results_of(run: Run) -> dict[str, bytes]:
+    """Read all published files, but the one that tells when and where it was made."""
+    run.verify()
+    return {rel: path.read_bytes() for rel, path in artefacts(run.out) if rel != ENVIRONMENT}
 
 
 def is_damaged(run: Run) -> bool:
@@ -230,9 +308,9 @@ CASES = {
     "R2": Case("The supervisor of a fit is killed", 100, 0, kill_supervisors),
     "R5": Case("A fit is cancelled, in every stage and however stubborn", 100, 0, cancel_fits),
     "R6": Case("A fit is cancelled while it publishes", 200, 2, race_cancels),
-    "R12": Case("The process of a fit is stopped, so that it hangs", 20, 0, stop_workers),
-    "R13": Case("The clock is set by hours, forth and back, during a fit", 10, 4, set_clocks),
-    "R14": Case("A second server is started on the same data folder", 10, 1, start_two_servers),
+    "R12": Case("The process of a fit is stopped, so that it hangs", 40, 0, stop_workers),
+    "R13": Case("The clock is set by hours, forth and back, during a fit", 100, 4, set_clocks),
+    "R14": Case("A second server is started on the same data folder", 100, 1, start_two_servers),
     "R15": Case(
         "The same fit is asked for again, at once and after restarts", 1000, 40, submit_again
     ),

@@ -14,19 +14,19 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-from queue_world import QueueWorld, queue_world, serving
+from queue_world import queue_world, serving
 from sheet_sequence import write_sheet
 from waiting import until
 
 from app.jobs.catalog import Catalog
 from app.jobs.processes import end_processes, processes_of, supervisor_of
-from app.jobs.scheduler import Scheduler
+from app.jobs.scheduler import ENDED, Scheduler
 from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import read_events
 from physhandi.run import Run
 from reliability import Case, Report
-from reliability.jobs import is_damaged
+from reliability.jobs import REAL, is_damaged, results_of
 
 TESTS = Path(__file__).parents[1]
 
@@ -90,7 +90,58 @@ def _states(told: dict[str, str], runs: dict[str, Run]) -> list[str]:
 
 
 def kill_servers(count: int, folder: Path, *, forgets: bool = False) -> Report:
-    """Kill the server and start another one, which has to find all as it was."""
+    """Kill the server and start another one, which has to find all as it was.
+
+    A tenth of the kills hit it while a real fit is at work, which has to end with the bits of an
+    undisturbed one.
+    """
+    real = count // 10
+    report = _kill_while_fits_wait(count - real, folder / "waiting", forgets=forgets)
+    if real:
+        report.update(_kill_while_one_is_fitted(real, folder / "fitted", forgets=forgets))
+    return report
+
+
+def _forget(folder: Path) -> None:
+    shutil.rmtree(folder / "cache", ignore_errors=True)
+    Catalog(ServerSettings(data_dir=folder)).reindex()
+
+
+def _kill_while_one_is_fitted(count: int, folder: Path, *, forgets: bool) -> Counter[str]:
+    chance = np.random.default_rng(3)
+    write_sheet(folder / "sequences" / "sheet")
+    settings = ServerSettings(data_dir=folder)
+    desk = Scheduler(settings, Catalog(settings))
+    counts: Counter[str] = Counter({"done": count, "of real fits": count})
+    expected: dict[str, bytes] | None = None
+    server = Server(folder)
+    try:
+        for number in range(count + 1):
+            server.kill()
+            run = desk.launch(["sheet"], "quick", f"real {number}", overrides=REAL)
+            server.start()
+            if expected is not None:
+                until(partial(_has_told, run.folder, int(chance.integers(1, 8))))
+                server.kill()
+                if forgets:
+                    _forget(folder)
+                server.start()
+            until(lambda run=run: server.look().get(run.id) in ENDED)
+            until(lambda run=run: supervisor_of(run.folder) is None)
+            expected = expected or results_of(run)
+            counts["lost"] += run.state != "succeeded" or run.attempt != 1
+            counts["corrupt"] += run.is_published and results_of(run) != expected
+            counts["orphans"] += len(list(processes_of(run.folder)))
+    finally:
+        server.kill()
+    return counts
+
+
+def _has_told(run_folder: Path, count: int) -> bool:
+    return len(read_events(run_folder)[0]) >= count
+
+
+def _kill_while_fits_wait(count: int, folder: Path, *, forgets: bool) -> Counter[str]:
     wrong = lost = 0
     with fits_at_work(folder) as (server, runs):
         expected = _states(server.look(), runs)
@@ -99,9 +150,7 @@ def kill_servers(count: int, folder: Path, *, forgets: bool = False) -> Report:
         for _ in range(count):
             server.kill()
             if forgets:
-                shutil.rmtree(folder / "cache", ignore_errors=True)
-                settings = ServerSettings(data_dir=folder)
-                Catalog(settings).reindex()
+                _forget(folder)
             # The first look of the new one, before which it has waited for nothing.
             server.start()
             wrong += _states(server.first, runs) != expected
@@ -112,16 +161,18 @@ def kill_servers(count: int, folder: Path, *, forgets: bool = False) -> Report:
         until(lambda: _states(server.look(), runs).count("succeeded") == 3)
         for run in runs.values():
             until(lambda run=run: supervisor_of(run.folder) is None)
-        return {
-            "done": count,
-            "wrong": wrong,
-            "lost": lost + sum(run.attempt != 1 for run in runs.values()),
-            "corrupt": sum(is_damaged(run) for run in (runs["publish"], *waiting)),
-            "published twice": sum(
-                len(list(run.folder.glob("attempts/*/MANIFEST.json"))) - 1 for run in waiting
-            ),
-            "orphans": sum(len(list(processes_of(run.folder))) for run in runs.values()),
-        }
+        return Counter(
+            {
+                "done": count,
+                "wrong": wrong,
+                "lost": lost + sum(run.attempt != 1 for run in runs.values()),
+                "corrupt": sum(is_damaged(run) for run in (runs["publish"], *waiting)),
+                "published twice": sum(
+                    len(list(run.folder.glob("attempts/*/MANIFEST.json"))) - 1 for run in waiting
+                ),
+                "orphans": sum(len(list(processes_of(run.folder))) for run in runs.values()),
+            }
+        )
 
 
 def drop_streams(count: int, folder: Path) -> Report:
@@ -141,7 +192,7 @@ def drop_streams(count: int, folder: Path) -> Report:
                 ]
                 world.tell(run_id, *reports)
                 written += 100
-                until(partial(_has_reported, world, run_id, written))
+                until(partial(_has_told, world.folder(run_id), written))
             numbers, last = _hear(port, world.token, run_id, last, int(chance.integers(1, 6)))
             heard += numbers
             done += 1
@@ -155,10 +206,6 @@ def drop_streams(count: int, folder: Path) -> Report:
         "lost": sum(number not in times for number in range(len(heard))),
         "wrong": sum(times.values()) - len(times) + (heard != sorted(heard)),
     }
-
-
-def _has_reported(world: QueueWorld, run_id: str, count: int) -> bool:
-    return len(read_events(world.folder(run_id))[0]) >= count
 
 
 def _hear(port: int, token: str, run_id: str, last: str, most: int) -> tuple[list[int], str]:
