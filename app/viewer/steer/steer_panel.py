@@ -207,7 +207,7 @@ class SteerPanel:
         self._gizmo: viser.TransformControlsHandle | None = None
         self._take: Take | None = None
         self._nodes = SceneNodes(server)
-        self._is_dragged = False
+        self._is_dragged = self._was_dragged = False
         self._refused = ""
         self._arrivals: deque[float] = deque(maxlen=200)
         self._written = -math.inf
@@ -548,7 +548,7 @@ class SteerPanel:
     def _remove_gizmo(self) -> None:
         if self._gizmo is not None:
             self._gizmo.remove()
-        self._gizmo, self._is_dragged = None, False
+        self._gizmo, self._is_dragged, self._was_dragged = None, False, False
 
     def _add_gizmo(self, take: Take, pose: Float[ndarray, "hand pose"]) -> None:
         number, finger = self._moved.hand, self._moved.finger
@@ -580,7 +580,7 @@ class SteerPanel:
                 steered.begin_gesture()
                 return
             if event.phase == "end":
-                self._is_dragged = False
+                self._is_dragged, self._was_dragged = False, True
             number, finger = self._moved.hand, self._moved.finger
             newest = steered.newest
             if number >= len(newest.take.hands):
@@ -635,6 +635,11 @@ class SteerPanel:
         pose = frame.pose[self._moved.hand]
         position = self._moved.place(hands[self._moved.hand], pose)
         wxyz = to_quaternion(pose[3:6] if self._moved.finger is None else np.zeros(3))
+        if self._was_dragged:
+            # Where the hand was before may have come after the last of the drag, and the browser
+            # shows that; viser sends nothing that it believes to be there.
+            self._was_dragged = False
+            gizmo.position, gizmo.wxyz = position + 0.01 * self._extent, -wxyz
         if not np.allclose(gizmo.position, position, atol=1e-6 * self._extent):
             gizmo.position = position
         if not np.allclose(gizmo.wxyz, wxyz, atol=1e-6):

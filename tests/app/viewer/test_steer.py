@@ -269,6 +269,24 @@ def looking_down_at(place: np.ndarray) -> SimpleNamespace:
     )
 
 
+def test_a_gizmo_that_is_let_go_is_told_again_where_its_hand_is(scene) -> None:
+    """A browser takes in what comes for its next picture, and so older places after the drag."""
+    session, client = scene
+    start = steer(client)
+    object_ = session._steer._object
+    fields = {"name": GIZMO, "owner": ""}
+    goal = start + np.array([0.0, 0.01, 0.02])
+    client.send("TransformControlsDragStartMessage", **fields)
+    position = [float(value) for value in goal]
+    client.send(
+        "TransformControlsUpdateMessage", wxyz=(1.0, 0.0, 0.0, 0.0), position=position, **fields
+    )
+    wait(client, lambda: np.allclose(object_.newest.pose[0, :3], goal - start, atol=1e-9))
+    client.positions[GIZMO] = tuple(start)
+    client.send("TransformControlsDragEndMessage", **fields)
+    wait(client, lambda: np.allclose(client.positions[GIZMO], goal, atol=1e-6))
+
+
 @pytest.fixture
 def towel() -> Iterator[Session]:
     """The bundled towel, which a hand with bones holds."""
