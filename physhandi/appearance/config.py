@@ -33,9 +33,12 @@ class AppearanceConfig(Settings, frozen=True, kw_only=True):
     similarity: _Share = 0.2
     """Share of structural similarity (SSIM) in the comparison of colors, beside their mean absolute
     difference."""
-    alpha_weight: _Weight = 1.0
+    first_color_weight: _Weight = 0.5
+    """Of the mean squared difference to the colors with which splats began, so that those which few
+    pixels show do not take on whatever makes up for an error of others."""
+    alpha_weight: _Weight = 0.5
     """Of the mean absolute difference between what splats cover and the object's mask."""
-    depth_weight: _Weight = 2.0
+    depth_weight: _Weight = 10.0
     """Of the mean absolute difference to the measured depth [1/m]."""
     hand_margin: Annotated[int, Meta(ge=0, le=100)] = 3
     """Pixels around hands that are left out like hands, since masks end a little early [px]."""

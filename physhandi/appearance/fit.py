@@ -4,7 +4,8 @@ They begin where depth was measured on the object, and on its surface where no v
 colors that are seen there. Then pictures of them are compared with each view in turn: color (mean
 absolute difference and structural similarity, as Kerbl et al. (2023) mix them), what they cover
 with the object's mask, and depth. Hands and what is near them are left out, since nobody knows what
-is behind. Their number stays: splats that have become invisible are moved to where the picture is
+is behind. At outlines, where recorded colors are mixed with those of what is behind, the mask alone
+is compared. Their number stays: splats that have become invisible are moved to where the picture is
 most wrong, each beside one that is there and that shares its opacity with it (S. Kheradmand et al.,
 3D Gaussian Splatting as Markov Chain Monte Carlo, 2024, without their noise).
 """
@@ -281,6 +282,7 @@ class _Target:
 
         self.camera = recorded.camera
         self.is_known = placed(recorded.is_known)
+        self.is_unmixed = placed(recorded.is_unmixed)[..., None]
         self.color = placed(recorded.color) * self.is_known[..., None]
         self.alpha = placed(recorded.is_object).float()
         self.depth = placed(recorded.depth)
@@ -302,6 +304,7 @@ class _Fit:
         self._draw = draw_splats_by_gsplat if takes_gsplat else draw_splats
         self.center, self.log_scale = leaf(start.center), leaf(np.log(start.scale))
         self.color = leaf(start.color)
+        self._first_color = self.color.detach().clone()
         self.logit = leaf(np.full(count, math.log(_START_OPACITY / (1.0 - _START_OPACITY))))
         self._adam = {
             name: Adam(rates, betas=_BETAS)
@@ -340,10 +343,12 @@ class _Fit:
         color, alpha, depth = self._draw(
             target.camera, self.center, self.log_scale, self.color, self.logit
         )
-        color = color * target.is_known[..., None]
+        color = torch.where(target.is_unmixed, color, target.color) * target.is_known[..., None]
         difference = (color - target.color).abs().sum() / (3.0 * target.size)
         unlike = (1.0 - _similarity(color, target.color)).sum() / (3.0 * target.size)
         loss = (1.0 - config.similarity) * difference + config.similarity * unlike
+        away = (self.color - self._first_color).square().sum(dim=1).mean()
+        loss = loss + config.first_color_weight * away
         cover = ((alpha - target.alpha).abs() * target.is_known).sum() / target.size
         far = ((depth - target.depth).abs() * alpha.detach() * target.has_depth).sum()
         return loss + config.alpha_weight * cover + config.depth_weight * far / target.size
@@ -366,6 +371,7 @@ class _Fit:
             self.center[dead] = self.center[parent] + offset
             self.center[parent] -= offset
             self.color[dead] = self.color[parent]
+            self._first_color[dead] = self._first_color[parent]
             for rows in (dead, parent):
                 self.log_scale[rows] = (_SPLIT * size).log()
                 self.logit[rows] = half.clamp(1e-4, 1.0 - 1e-4).logit()
@@ -382,6 +388,7 @@ class _Fit:
         }
         return state | {
             "pull": self._pull.cpu().numpy().copy(),
+            "first_color": self._first_color.cpu().numpy().copy(),
             "curve": np.array(curve, np.float64),
         }
 
@@ -394,6 +401,7 @@ class _Fit:
                 {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
             )
         self._pull.copy_(torch.from_numpy(state["pull"]))
+        self._first_color.copy_(torch.from_numpy(state["first_color"]))
         return [float(value) for value in state["curve"]]
 
     @torch.no_grad()

@@ -27,6 +27,9 @@ class RecordedObject:
     """The object over black, from 0 to 1."""
     is_object: Bool[ndarray, "row column"]
     """Pixels of the object."""
+    is_unmixed: Bool[ndarray, "row column"]
+    """Pixels at no outline of the object. In those beside it, the object's color is mixed with that
+    of what is behind, by no share that anybody knows."""
     is_known: Bool[ndarray, "row column"]
     """Pixels that tell whether the object is there: those that no hand is at or near."""
     depth: Float32[ndarray, "row column"]
@@ -70,10 +73,12 @@ def _cut_out(view: View, frame: int, hand_margin: int) -> RecordedObject:
     K[:2, 2] -= [left, top]
     is_object, near_hand = is_object[part], near_hand[part]
     height, width = is_object.shape
+    whole, beside = is_object.astype(np.uint8), np.ones((3, 3), np.uint8)
     return RecordedObject(
         camera=replace(camera, K=K, width=width, height=height),
         color=np.where(is_object[..., None], color[part] / np.float32(255.0), np.float32(0.0)),
         is_object=is_object,
+        is_unmixed=cv2.dilate(whole, beside) == cv2.erode(whole, beside),
         is_known=~near_hand,
         depth=np.where(is_object, depth[part], np.float32(0.0)),
     )

@@ -281,11 +281,11 @@ def contact_changes(
     """Find the nodes that are held in a frame and were not `RECENT` frames ago, and the reverse."""
     if model.is_always_attached:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    now, before = (
-        np.unique(model.spring_nodes[virtual_springs_in(model, at)].min(axis=1))
-        for at in (frame, max(frame - RECENT, 0))
-    )
-    return np.setdiff1d(now, before), np.setdiff1d(before, now)
+    held = np.zeros((2, model.node_count), bool)
+    for is_held, at in zip(held, (frame, max(frame - RECENT, 0)), strict=True):
+        is_held[model.spring_nodes[virtual_springs_in(model, at)].min(axis=1)] = True
+    now, before = held
+    return np.flatnonzero(now & ~before), np.flatnonzero(before & ~now)
 
 
 def virtual_springs_in(model: SpringMassModel, frame: int | None) -> Int[ndarray, " spring"]:

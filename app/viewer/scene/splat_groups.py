@@ -16,10 +16,10 @@ from scipy.cluster import vq as _vq
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from physhandi.appearance.binding import SplatBinding
+from physhandi.appearance.binding import SplatBinding, polar_rotations
 from physhandi.appearance.splats import Splats
 
-MOST_GROUPS = 128
+MOST_GROUPS = 64
 """Most groups of one object."""
 _FEWEST = 8
 """Splats that a group has on average, unless it is one of `MOST_GROUPS`."""
@@ -82,9 +82,8 @@ class SplatGroups:
         columns = np.swapaxes(turned, 1, 2).reshape(-1, 3)
         found: ndarray = self._sums @ np.concatenate([columns, node.astype(np.float64)])
         middle, moment = found[: self.count], found[self.count :].reshape(3, self.count, 3)
-        left, _, right = np.linalg.svd(np.moveaxis(moment, 0, -1))
-        left[..., 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))[:, None]
-        return Rotation.from_matrix(left @ right).as_quat(scalar_first=True), middle
+        turn = polar_rotations(np.moveaxis(moment, 0, -1), thin=0.0)
+        return Rotation.from_matrix(turn).as_quat(scalar_first=True), middle
 
     def place(self, node: Float[ndarray, "node 3"]) -> Float32[ndarray, "splat 3"]:
         """Find where the splats are drawn when the nodes are somewhere [m]."""

@@ -82,14 +82,14 @@ def test_groups_lie_as_near_as_rigid_ones_can_to_where_nodes_carry_them() -> Non
 def test_more_groups_lose_less_of_a_bend() -> None:
     splats, node = splats_on(sheet(), 4_000), rolled(sheet(), 0.05)
     lost = []
-    for most in (16, 64, MOST_GROUPS):
+    for most in (8, 24, MOST_GROUPS):
         groups = SplatGroups.of(splats, most)
         assert groups.count == most
         offset = groups.place(node) - groups.binding.carry(node[None])[0]
         lost.append(float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))))
     assert lost[0] > 1.5 * lost[1]
     assert lost[1] > 1.2 * lost[2]
-    assert lost[2] < 0.001
+    assert lost[2] < 0.0012
 
 
 def test_a_scene_opens_on_the_splats_and_moves_them(sessions, run, catalog) -> None:
@@ -105,7 +105,7 @@ def test_a_scene_opens_on_the_splats_and_moves_them(sessions, run, catalog) -> N
 
         def is_there() -> bool:
             names = [name for name in client.nodes if name.startswith("/object/splats/")]
-            if len(names) < 75 or not all(name in client.positions for name in names):
+            if len(names) < MOST_GROUPS or not all(name in client.positions for name in names):
                 return False
             return distances(splats_seen(client)[0], carried).min(axis=1).max() < 1e-4
 

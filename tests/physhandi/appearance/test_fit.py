@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -154,6 +155,30 @@ def test_pixels_of_hands_and_beside_them_teach_nothing(fitted: FittedSplats) -> 
     is_pink = (found.color[:, 0] > 0.7) & (found.color[:, 1] < 0.3) & (found.color[:, 2] > 0.7)
     assert not is_pink.any()
     assert psnr(found, UNSEEN) > psnr(fitted.splats, UNSEEN) - 1.5
+
+
+def test_colors_that_are_mixed_at_outlines_teach_nothing(fitted: FittedSplats) -> None:
+    views = [MadeView(camera) for camera in CAMERAS]
+    for view in views:
+        shape, beside = view.mask(0), np.ones((3, 3), np.uint8)
+        view.color(0)[(shape > 0) & (cv2.erode(shape, beside) == 0)] = [255, 0, 255]
+    assert np.mean([(view.color(0) == [255, 0, 255]).all(axis=2).sum() for view in views]) > 60
+    found = fit_splats(views, sheet().rest_node, config=CONFIG).splats
+    assert psnr(found, UNSEEN) > psnr(fitted.splats, UNSEEN) - 0.8
+
+
+def test_colors_stay_near_those_they_began_with_as_asked(views: list[View]) -> None:
+    def moved(weight: float) -> float:
+        config = AppearanceConfig(
+            splat_count=500, iterations=20, renewal_interval=100, first_color_weight=weight
+        )
+        found = fit_splats(views, sheet().rest_node, config=config).splats
+        return float(np.abs(found.color - start.color[: len(found.color)]).mean())
+
+    none = AppearanceConfig(splat_count=500, iterations=0)
+    start = fit_splats(views, sheet().rest_node, config=none).splats
+    assert moved(0.0) > 0.03
+    assert moved(1e4) < 0.3 * moved(0.0)
 
 
 def test_the_surface_tells_what_no_view_shows() -> None:
