@@ -18,6 +18,7 @@ from waiting import until
 from app.jobs.processes import processes_of, supervisor_of
 from app.jobs.recovery.left_behind import find_left_behind
 from app.jobs.scheduler import ENDED
+from app.jobs.ticket import QUEUED, STARTED
 from app.settings import ServerSettings
 from physhandi.data.run_folder import read_events
 from physhandi.run import Run
@@ -172,10 +173,9 @@ class Soak:
         self.counts["simulations"] += 1
 
     def _new_run(self, before: set[Path]) -> list[Path]:
+        """Find runs that came up since, once they are in line: until then they count as failed."""
         new = set(self._settings.run_dir.iterdir()) - before
-        return [
-            path for path in new if not path.name.startswith(".") and (path / "run.yaml").is_file()
-        ]
+        return [path for path in new if (path / QUEUED).is_file() or (path / STARTED).is_file()]
 
     def _watch(self) -> None:
         """Open scenes, leave them politely or not, and close them."""
