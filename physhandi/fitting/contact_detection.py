@@ -49,6 +49,9 @@ MOST_SURFACE_NODES = 24
 """Most control nodes of a piece."""
 OPENING = 0.75
 """Part of a hand's places that hold from which another one must be moved apart for it to open."""
+EVIDENCE, FARTHER = 3.0, 2.0
+"""Longest way from a node to the nearest track that tells its motion, in distances of nodes, or in
+what it is at frame 0 if that is more. Where all are farther away, what holds a node is not told."""
 MOST_PAIRS = 80
 """Most pairs of a control node at a time."""
 
@@ -110,22 +113,28 @@ def find_contacts(
     spacing = node_distance(start)
     hands = _hands(np.asarray(control[:frame_count], np.float64), SURFACE * spacing)
     seen = observed_nodes(observation, start, frame_count)
+    is_told = _told_nodes(observation, start, frame_count, spacing)
+    last_told = np.maximum.accumulate(np.where(is_told, np.arange(frame_count)[:, None], 0), axis=0)
     near = [KDTree(hand).query(nodes) for hand, nodes in zip(hands.control, seen, strict=True)]
     distance, nearest = (np.array(values) for values in zip(*near, strict=True))
     reach = np.clip(neighbor_distance(hands.control[0]), spacing, COARSEST_HAND * spacing)
     shortest = max(2, round(SHORTEST * frame_rate))
     window = 2 * round(SMOOTHING * frame_rate / 2) + 1
+    # What nothing shows stays beside the hand where it was seen last.
+    distance = np.take_along_axis(distance, last_told, axis=0)
+    nearest = np.take_along_axis(nearest, last_told, axis=0)
     held: list[tuple[int, int, int]] = []
     for index in np.flatnonzero((distance < NEAR_HAND * reach).any(axis=0)):
         candidate, which = np.unique(nearest[:, index], return_inverse=True)
-        local = median_filter(
-            hands.seen_from(seen[:, index], candidate), size=(1, window, 1), mode="nearest"
-        )
+        local = hands.seen_from(seen[:, index], candidate)[:, last_told[:, index]]
+        local = median_filter(local, size=(1, window, 1), mode="nearest")
         is_near = distance[:, index] < NEAR_HAND * reach
         tolerance = SLIP * spacing + GIVE * distance[:, index]
         held += [
             (int(index), *contact)
-            for contact in _contacts_of(local[which], is_near, tolerance, shortest)
+            for contact in _contacts_of(
+                local[which], is_near, tolerance, is_told[:, index], shortest
+            )
         ]
     last = frame_count - 1
     holding = np.unique([nearest[last, index] for index, _, end in held if end == last]).astype(int)
@@ -177,6 +186,26 @@ def observed_nodes(
     return seen
 
 
+def _told_nodes(
+    observation: ObjectObservation,
+    node: Float[ndarray, "node 3"],
+    frame_count: int,
+    spacing: float,
+) -> Bool[ndarray, "frame node"]:
+    """Tell which nodes have a track near them in a frame; at frame 0 all places are known."""
+    of_node = observation.node_of_track
+    anchor = observation.point[0] if of_node is None else node[of_node]
+    is_usable = observation.is_visible[:frame_count]
+    if of_node is None:
+        is_usable = is_usable & observation.is_visible[0]
+    away = np.full((frame_count, len(node)), np.inf)
+    for frame in np.flatnonzero(is_usable.any(axis=1)):
+        away[frame] = KDTree(anchor[is_usable[frame]]).query(node)[0]
+    is_told = away <= np.maximum(EVIDENCE * spacing, FARTHER * away[0])
+    is_told[0] = True
+    return is_told
+
+
 def _hands(control: Float[ndarray, "frame control 3"], radius: float) -> _Hands:
     """Find how the hand's surface around each control node turns after frame 0."""
     count = control.shape[1]
@@ -203,6 +232,7 @@ def _contacts_of(
     local: Float[ndarray, "seed frame 3"],
     is_near: Bool[ndarray, " frame"],
     tolerance: Float[ndarray, " frame"],
+    is_told: Bool[ndarray, " frame"],
     shortest: int,
 ) -> list[tuple[int, int]]:
     """Find a node's contacts: the longest runs of frames in which it stays, and do not overlap.
@@ -211,7 +241,9 @@ def _contacts_of(
         local: For each frame as a seed, the node's places seen from the surface nearest to it then.
         is_near: Whether the node is near a hand.
         tolerance: How far it may be from its place in a seed's frame.
-        shortest: Fewest frames of a contact.
+        is_told: Whether anything shows where it is. Frames that tell nothing neither begin nor end
+            a contact, but for the last one, up to which goes on what held before.
+        shortest: Fewest frames of a contact that tell of it.
 
     Returns:
         First and last frame of each.
@@ -220,23 +252,28 @@ def _contacts_of(
     frame = np.arange(count)
     free = is_near.copy()
     away = np.linalg.norm(local - local[frame, frame][:, None], axis=-1)
+    told_before = np.concatenate([[0], is_told.cumsum()])
     found: list[tuple[int, int]] = []
     while free.any():
         blocked = ~((away < tolerance[:, None]) & free)
         first = np.where(blocked & (frame <= frame[:, None]), frame, -1).max(axis=1) + 1
         last = np.where(blocked & (frame >= frame[:, None]), frame, count).min(axis=1) - 1
-        length = np.where(free, last - first + 1, 0)
+        length = np.where(free & is_told, told_before[last + 1] - told_before[first], 0)
         if length.max() < shortest:
             break
         longest = np.flatnonzero(length == length.max())
-        drift = [away[seed, first[seed] : last[seed] + 1].mean() for seed in longest]
+        drift = [
+            away[seed, first[seed] : last[seed] + 1][is_told[first[seed] : last[seed] + 1]].mean()
+            for seed in longest
+        ]
         seed = longest[np.argmin(drift)]
         begin, end = int(first[seed]), int(last[seed])
         free[begin : end + 1] = False
-        place = local[seed, begin : end + 1]
+        told = begin + np.flatnonzero(is_told[begin : end + 1])
+        place = local[seed, told]
         off = np.linalg.norm(place - np.median(place, axis=0), axis=1) / tolerance[seed]
-        attached = begin + np.flatnonzero(off < max(LATE, 1.001 * off.min()))
-        holding = begin + np.flatnonzero(off < max(EARLY, 1.001 * off.min()))
+        attached = told[off < max(LATE, 1.001 * off.min())]
+        holding = told[off < max(EARLY, 1.001 * off.min())]
         begin = 0 if holding[0] == 0 else int(attached[0])
         end = end if end == count - 1 else int(holding[-1])
         if begin < end:

@@ -229,3 +229,41 @@ def test_the_nearest_control_nodes_hold_a_node_if_there_are_many() -> None:
         limited += len(nearest) > 3
         np.testing.assert_array_equal(np.sort(few.distance[few.node == node]), nearest[:3])
     assert limited > 3
+
+
+def hidden_around(middle: int, frames: np.ndarray, point: np.ndarray) -> ObjectObservation:
+    """Tracks of which those within 35 mm of a node are not seen in some frames."""
+    visible = np.ones(point.shape[:2], bool)
+    visible[np.ix_(frames, np.linalg.norm(SHEET - SHEET[middle], axis=1) < 0.035)] = False
+    return ObjectObservation(point=point, is_visible=visible, is_motion_valid=visible)
+
+
+def test_what_hands_hide_is_not_let_go_because_tracks_far_from_it_stay_behind() -> None:
+    way = along(0, ramp(3, 36, 0.06))
+    point = np.stack([SHEET + shift for shift in way])
+    far = np.linalg.norm(SHEET - SHEET[MIDDLE], axis=1) >= 0.035
+    point[:, far] = SHEET[far]  # The sheet bends between them.
+    assert at(found(observation(point), hand(ABOVE + way)), MIDDLE) == [[0, NEVER]]
+    hidden = hidden_around(MIDDLE, np.arange(14, FRAMES), point)
+    assert at(found(hidden, hand(ABOVE + way)), MIDDLE) == [[0, NEVER]]
+
+
+def test_what_was_let_go_while_it_was_hidden_is_held_as_far_as_it_was_seen() -> None:
+    # The hand goes on alone from frame 16, and the sheet is seen again where it was then.
+    way, own = along(0, ramp(3, 36, 0.06)), along(0, np.minimum(ramp(3, 36, 0.06), 0.06 * 13 / 33))
+    point = np.stack([SHEET + shift for shift in own])
+    hidden = hidden_around(MIDDLE, np.arange(12, 30), point)
+    ((begin, end),) = at(found(hidden, hand(ABOVE + way)), MIDDLE)
+    assert begin == 0
+    assert 10 <= end <= 11
+
+
+def test_what_no_frame_shows_from_near_is_told_by_what_is_nearest() -> None:
+    way = along(0, ramp(3, 30, 0.06))
+    point = np.stack([SHEET + shift for shift in way])
+    hidden = hidden_around(MIDDLE, np.arange(FRAMES), point)
+    assert at(found(hidden, hand(ABOVE + way)), MIDDLE) == [[0, NEVER]]
+    leaving = along(2, ramp(22, 32, 0.04))
+    ((begin, end),) = at(found(hidden, hand(ABOVE + way + leaving)), MIDDLE)
+    assert begin == 0
+    assert 22 <= end <= 24
