@@ -1,5 +1,7 @@
-"""Colors, clicks and keys of the bundled run, in a real browser."""
+"""Colors, clicks and keys of the bundled run, with splats too, in a real browser."""
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,12 +11,17 @@ from playwright.sync_api import Error as PlaywrightError
 from scene_page import ScenePage
 from viewer_world import FolderCatalog
 
+from app.benchmarks.splats import scattered
 from app.viewer.content.content import open_run
 from app.viewer.scene.framing import frame_content
+from physhandi.data.layout import SPLATS_FILE
+from physhandi.run import Run
 
 pytestmark = pytest.mark.e2e
 BUNDLED = Path(__file__).parents[2] / "sequences"
 FRAME, NODE = 30, 0
+PURPLE = (0.8, 0.0, 0.8)
+"""A color that nothing of the scene has."""
 
 
 def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
@@ -160,3 +167,52 @@ def test_a_lasso_selects_nodes_that_are_cut_apart_and_undone(shared_scene) -> No
     scene.until(lambda: scene.has("No edits."), "it is undone")
     page.keyboard.press("b")
     scene.until(lambda: scene.has("Edit (B)"), "playback again")
+
+
+def purple(scene: ScenePage) -> int:
+    """Count the pixels that have the color of the splats."""
+    image = shot_of(scene)
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return int(((red > 110) & (blue > 110) & (green < 70)).sum())
+
+
+@pytest.fixture(scope="module")
+def seen(own_server) -> Run:
+    """The bundled run as one whose object has purple splats."""
+    content = open_run(FolderCatalog(BUNDLED), "towel_fold_quick")
+    surface, fitted = content.surface, content.fitted
+    assert surface is not None
+    assert fitted is not None
+    splats = scattered(surface, fitted.position[0], 1_000)
+    splats = replace(splats, color=np.tile(np.float32(PURPLE), (1_000, 1)))
+    bundled = Run.open(BUNDLED / "runs" / "towel_fold_quick")
+    run = Run.create(
+        own_server.data_dir / "runs" / "seen",
+        name="Seen",
+        kind="reconstruction",
+        sequences=[str(own_server.data_dir / "sequences" / "towel_fold")],
+        config={},
+    )
+    with run.begin_attempt() as attempt:
+        shutil.copytree(bundled.out, attempt.out, dirs_exist_ok=True)
+        attempt.save_tensors(SPLATS_FILE, splats.to_tensors())
+        attempt.publish()
+    return run
+
+
+def test_a_scene_opens_on_the_splats_and_a_key_goes_on(context, own_server, seen) -> None:
+    home = context.new_page()
+    home.goto(own_server.url)
+    home.goto(f"{home.url.partition('?')[0].rstrip('/')}/runs/{seen.id}")
+    home.locator("[data-open=run]").first.click()
+    home.wait_for_url("**/live/**")
+    scene = ScenePage(home)
+    scene.until(lambda: scene.has("object springs"), "the panel appears")
+    scene.pause()
+    scene.until(lambda: purple(scene) > 5_000, "the splats are drawn in their color")
+    home.locator(".hints").click()
+    for form in ("surface", "nodes"):
+        press_and_see(scene, "0", "show")
+        scene.until(lambda: purple(scene) < 50, f"the {form} has its own color")
+    press_and_see(scene, "0", "show")
+    scene.until(lambda: purple(scene) > 5_000, "the splats are drawn again")
