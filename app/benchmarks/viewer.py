@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from app.benchmarks.browser import (
     measure_first_paint,
@@ -32,6 +32,9 @@ from physhandi.data.layout import SequenceFiles
 from physhandi.devices import start_warp
 from physhandi.errors import MissingInputError
 from physhandi.run import Run
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 _RATE = 30.0
 _SESSIONS = 10
@@ -158,6 +161,7 @@ class _Bench:
         self._effort = effort
         self._stack = ExitStack()
         self._server: Served | None = None
+        self._chromium: Browser | None = None
 
     def __enter__(self) -> "_Bench":
         return self
@@ -198,14 +202,19 @@ class _Bench:
             self._server = self._stack.enter_context(Served(self._data("plain")))
         return self._server
 
+    def _opened_browser(self) -> "Browser":
+        """Open the browser of all parts, unless it was opened before; each has pages of its own."""
+        if self._chromium is None:
+            self._chromium = self._stack.enter_context(open_chromium())
+        return self._chromium
+
     def _paint(self) -> dict[str, Any]:
-        with open_chromium() as browser:
-            return measure_first_paint(self._served(), browser, self._effort.visits)
+        browser = self._opened_browser()
+        return measure_first_paint(self._served(), browser, self._effort.visits)
 
     def _open(self) -> dict[str, Any]:
-        with open_chromium() as browser:
-            served = self._served()
-            return measure_opening(served, browser, self._run.id, self._effort.visits)
+        browser, served = self._opened_browser(), self._served()
+        return measure_opening(served, browser, self._run.id, self._effort.visits)
 
     def _scrub(self) -> dict[str, Any]:
         shown = MeasuredSlider(self._run, self._sequence, FIELDS[0]).fitted
@@ -230,9 +239,8 @@ class _Bench:
     def _browser(self) -> dict[str, Any]:
         slider = MeasuredSlider(self._run, self._sequence, FIELDS[0])
         moves = slider.moves(self._effort.moves)
-        with open_chromium() as browser:
-            served = self._served()
-            return measure_slider_in_browser(served, browser, self._run.id, slider, moves)
+        browser, served = self._opened_browser(), self._served()
+        return measure_slider_in_browser(served, browser, self._run.id, slider, moves)
 
     def _start(self) -> dict[str, Any]:
         slider = MeasuredSlider(self._run, self._sequence, FIELDS[0])
@@ -278,8 +286,8 @@ class _Bench:
     def _splats(self) -> dict[str, Any]:
         from app.benchmarks.splats import measure_splats
 
-        with open_chromium() as browser:
-            return measure_splats(self._run, self._sequence, browser, self._effort.seconds / 2)
+        seconds = self._effort.seconds / 2
+        return measure_splats(self._run, self._sequence, self._opened_browser(), seconds)
 
     def _live(self) -> dict[str, Any]:
         from app.benchmarks.latency import measure_latency
