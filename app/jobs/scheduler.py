@@ -290,12 +290,14 @@ class Scheduler:
                 self._enqueue(run, priority, who)  # The server was killed before it did so.
             return run
 
-    def start_now(self, run: Run) -> None:
-        """Start a run beside the line, for what takes seconds while somebody waits."""
+    def start_now(self, make: Callable[[], Run]) -> Run:
+        """Make a run and start it beside the line, for what takes seconds while somebody waits."""
         with self._lock:
+            run = make()
             # It takes seconds, so it may be where memory is short.
             device = self._local.choose(self._devices_of(self._local)) or self._settings.devices[0]
             self._start(run.folder, self._local, device)
+        return run
 
     def resume(
         self,
@@ -478,6 +480,9 @@ class Scheduler:
             if entry is not None and entry[0] == stamp:
                 return entry[1]
             view = self._look(item.run)
+            if view.state == "failed" and item.run.state == "queued":
+                with self._lock:  # Under it runs are made; this one may just have been.
+                    view = self._look(self._catalog.run(item.id))
         except (PhysHandiError, OSError) as error:
             return JobView("damaged", reason=describe(error))
         except Exception as error:  # One folder must never stop the queue.

@@ -423,6 +423,42 @@ def test_a_full_disk_keeps_a_run_in_line_until_there_is_room(
     assert caplog.text.count(f"run {run_id} cannot go on") == 1
 
 
+def test_a_run_that_is_just_being_made_is_not_told_as_failed(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(data_dir)
+    monkeypatch.setattr(
+        local_engine, "start_supervisor", lambda *_, **__: SimpleNamespace(poll=lambda: None)
+    )
+    look, has_looked = desk.scheduler._look, threading.Event()
+    seen: list[JobView] = []
+
+    def watched(run: Run) -> JobView:
+        view = look(run)
+        has_looked.set()
+        return view
+
+    def make() -> Run:
+        monkeypatch.setattr(desk.scheduler, "_look", watched)
+        run = Run.create(
+            data_dir / "runs" / "new", name="new", kind="simulation", sequences=["sheet"], config={}
+        )
+        looking.start()
+        assert has_looked.wait(LIMIT_S)  # And nothing is there yet that says it is begun.
+        return run
+
+    looking = threading.Thread(target=lambda: seen.append(desk.view("new")))
+    desk.scheduler.start_now(make)
+    looking.join(LIMIT_S)
+    assert [view.state for view in seen] == ["starting"]
+    # One whose server was killed before it began stays what it is.
+    Run.create(
+        data_dir / "runs" / "old", name="old", kind="simulation", sequences=["sheet"], config={}
+    )
+    assert desk.view("old").state == "failed"
+    assert "never started" in desk.view("old").reason
+
+
 def test_the_worker_never_learns_the_token(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PHYSHANDI_TOKEN", "do-not-tell-anybody")
     run_id = desk.launch("stubborn")
@@ -467,6 +503,6 @@ def test_a_sweep_spares_the_run_that_is_just_being_started(
     }.items():
         monkeypatch.setattr(local_engine, name, stand_in)
     monkeypatch.setattr(desk.scheduler, "_lock", WatchedLock())
-    desk.scheduler.start_now(new)
+    desk.scheduler.start_now(lambda: new)
     sweeper.join(LIMIT_S)
     assert ended == [(lost, False)]  # To end them takes long, so nobody waits for it.

@@ -135,7 +135,7 @@ def test_a_fit_is_told_of_the_store(
         fill_run(run.folder, "cpu", lambda: None)
     assert [store.url if store else None for store in told] == ["file:///a store", None]
     with patch.object(local_engine, "start_supervisor") as start:
-        desk.scheduler.start_now(run)
+        desk.scheduler.start_now(lambda: run)
     assert start.call_args.kwargs["store"] == "file:///a store"
 
 
@@ -400,7 +400,7 @@ def test_what_takes_seconds_runs_beside_the_server(desk: ClusterDesk, cluster: M
     (run.folder / QUEUED).unlink()
     with patch.object(local_engine, "start_supervisor") as start:
         start.return_value.poll.return_value = None
-        desk.scheduler.start_now(run)
+        desk.scheduler.start_now(lambda: run)
         waiting = desk.launch()
         desk.step()
         # It takes no place of the cluster's.

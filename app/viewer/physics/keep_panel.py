@@ -66,7 +66,7 @@ class RunSaver:
         self,
         catalog: Catalog,
         folder: Path,
-        start: Callable[[Run], None],
+        start: Callable[[Callable[[], Run]], Run],
         sequences: Path | None = None,
     ) -> None:
         """Prepare.
@@ -74,7 +74,7 @@ class RunSaver:
         Args:
             catalog: Finds the run that was shown, and its recordings.
             folder: Where runs are made.
-            start: Has a worker begin with a run at once.
+            start: Makes a run by what it is given, and has a worker begin with it at once.
             sequences: Where recordings are made; None for ``sequences`` beside the runs.
         """
         self._catalog = catalog
@@ -108,21 +108,24 @@ class RunSaver:
         source = self._catalog.run(source_id)
         recordings = self._catalog.sequences_of(source)
         recording = recordings[source.sequence_names.index(sequence)]
-        run = Run.create(
-            self._folder / new_run_id(),
-            name=name,
-            kind="simulation",
-            sequences=[str(recording.folder)],
-            config={
-                "source": str(source.folder.resolve()),
-                **({} if edits is None else {"edits": describe_edits(edits)}),
-                "parameters": dict(changes),
-            },
-        )
-        if edits is not None:
-            store_edits(run.folder, edits)
-        self._start(run)
-        return run
+
+        def make() -> Run:
+            run = Run.create(
+                self._folder / new_run_id(),
+                name=name,
+                kind="simulation",
+                sequences=[str(recording.folder)],
+                config={
+                    "source": str(source.folder.resolve()),
+                    **({} if edits is None else {"edits": describe_edits(edits)}),
+                    "parameters": dict(changes),
+                },
+            )
+            if edits is not None:
+                store_edits(run.folder, edits)
+            return run
+
+        return self._start(make)
 
     def save_take(
         self, source_id: str, stored: StoredTake, name: str, changes: Mapping[str, Any]
@@ -150,20 +153,23 @@ class RunSaver:
         source = self._catalog.run(source_id)
         if keeps_springs(source):  # What is steered of such an object is an edited one, too.
             stored = replace(stored, take=replace(stored.take, is_edited=True))
-        run = Run.create(
-            self._folder / new_run_id(),
-            name=name,
-            kind="simulation",
-            sequences=[str(folder)],
-            config={
-                "source": str(source.folder.resolve()),
-                "parameters": dict(changes),
-                "take": stored.to_dict(),
-            },
-        )
-        stored.save(run.folder)
-        self._start(run)
-        return run
+
+        def make() -> Run:
+            run = Run.create(
+                self._folder / new_run_id(),
+                name=name,
+                kind="simulation",
+                sequences=[str(folder)],
+                config={
+                    "source": str(source.folder.resolve()),
+                    "parameters": dict(changes),
+                    "take": stored.to_dict(),
+                },
+            )
+            stored.save(run.folder)
+            return run
+
+        return self._start(make)
 
     def follow(
         self, run: Run, report: Callable[[SavedRun], None], is_closed: threading.Event

@@ -1,4 +1,4 @@
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -55,7 +55,12 @@ def storage(
     noted: list[tuple[str, str, str | None]],
 ) -> UserStorage:
     """Where users keep presets and runs."""
-    saver = RunSaver(catalog, tmp_path / "runs", begun.append)
+
+    def start(make: Callable[[], Run]) -> Run:
+        begun.append(make())
+        return begun[-1]
+
+    saver = RunSaver(catalog, tmp_path / "runs", start)
     presets = PresetStore(tmp_path / "presets")
     edit_presets = EditPresetStore(presets.folder)
     return UserStorage(presets, edit_presets, saver, lambda *told: noted.append(told))
