@@ -11,7 +11,7 @@ from typing import Any
 from unittest.mock import patch
 
 import psutil
-from waiting import LIMIT_S
+from waiting import LIMIT_S, until
 
 from app.jobs.engines import cluster as cluster_module
 
@@ -94,7 +94,16 @@ class MadeCluster:
             for member in (*family, process):
                 with suppress(psutil.NoSuchProcess, ProcessLookupError):
                     member.kill()
+            until(lambda: all(_has_ended(member) for member in family))
         process.wait()
+
+
+def _has_ended(process: psutil.Process) -> bool:
+    """Tell whether a process has; what nobody asks after stays a zombie."""
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
 
 
 @contextmanager
