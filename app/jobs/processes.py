@@ -21,6 +21,8 @@ COOKIE = "PHYSHANDI_RUN"
 _LOCK = ".supervisor.lock"
 _FOLLOWER_LOCK = ".follower.lock"
 _PR_SET_CHILD_SUBREAPER = 36
+_LOADING_S = 5.0
+"""Longest time for which a program that is being loaded is waited for [s]."""
 
 
 def cookie_of(run_folder: Path, nonce: str) -> str:
@@ -43,13 +45,41 @@ def processes_of(run_folder: Path, nonce: str | None = None) -> Iterator[psutil.
 
 def marked_processes() -> Iterator[tuple[psutil.Process, str]]:
     """Find every live process that belongs to some run, with its mark."""
+    # It remembers processes since the last look, of which some have left their number to others.
+    psutil.process_iter.cache_clear()
     for process in psutil.process_iter():
         try:
-            cookie = process.environ().get(COOKIE)
+            cookie = _environment(process).get(COOKIE)
             if cookie and process.status() != psutil.STATUS_ZOMBIE:
                 yield process, cookie
         except (psutil.Error, OSError):
             continue  # Gone meanwhile, or of another user: then it is none of ours.
+
+
+def _environment(process: psutil.Process) -> dict[str, str]:
+    """Read a process's environment, which is empty for a moment after it was started.
+
+    `Popen` returns as soon as the kernel lets go of what the caller had open, up to 30 ms before
+    the new program has its environment on a busy machine.
+    """
+    end = time.monotonic() + _LOADING_S
+    while not (environment := process.environ()):
+        if not is_loading(Path(f"/proc/{process.pid}/stat").read_text()):
+            return process.environ()  # It may have got one after the look at it.
+        if time.monotonic() > end:
+            break
+        time.sleep(0.001)
+    return environment
+
+
+def is_loading(stat: str) -> bool:
+    """Tell from a process's ``/proc/PID/stat`` whether its program is only being loaded.
+
+    It has memory then, unlike the kernel's own processes, but not yet a place of its environment.
+    """
+    field = stat.rpartition(")")[2].split()
+    size, start_of_environment = field[20], field[47]
+    return size != "0" and start_of_environment == "0"
 
 
 def end_processes(
