@@ -6,7 +6,9 @@ that failed says why (``error``, and ``kind``, the name of the error's class). E
 is printed goes to standard error, of which the parent keeps a bounded log.
 """
 
+import atexit
 import ctypes
+import gc
 import json
 import logging
 import os
@@ -369,6 +371,8 @@ def run_child(work: Callable[[Channel], None]) -> NoReturn:
 
     The process ends with its parent, unless that was started to outlive it.
     """
+    # A process that ends has no use for a search among all that torch and Warp have loaded.
+    atexit.register(gc.freeze)
     parent = os.environ.pop(_PARENT, "")
     if parent:
         die_with_parent(int(parent))

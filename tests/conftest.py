@@ -1,5 +1,6 @@
 """Fixtures that all tests share."""
 
+import atexit
 import gc
 import os
 import sys
@@ -23,6 +24,8 @@ def pytest_configure(config):
     sys.dont_write_bytecode = False
     # What a disk keeps through a power failure no test can see, and many wait for it.
     os.fsync = lambda _descriptor: None
+    # When all is over, nothing is gained by a search for garbage.
+    atexit.register(gc.freeze)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,5 +1,7 @@
 """The `physhandi` command: functions become subcommands, and every failure is one clear line."""
 
+import atexit
+import gc
 import logging
 import sys
 
@@ -61,6 +63,8 @@ def build() -> SubcommandApp:
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 failed with one clear line, 2 bad usage."""
+    # A command that ends has no use for a search among all that it has loaded.
+    atexit.register(gc.freeze)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
         code = build().cli(prog="physhandi", args=argv, config=(tyro.conf.OmitArgPrefixes,)) or 0

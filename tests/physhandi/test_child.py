@@ -223,3 +223,18 @@ def test_a_folder_of_the_user_s_named_like_a_package_is_not_run(tmp_path: Path) 
         check=False,
     )
     assert (done.stdout, done.returncode) == (f"{PACKAGE_ROOT}\n", 0), done.stderr
+
+
+def test_a_process_that_ends_searches_nothing_of_what_it_has_loaded() -> None:
+    code = (
+        "import atexit, gc\n"
+        "atexit.register(lambda: print(gc.get_freeze_count(), len(gc.get_objects())))\n"
+        "from physhandi.child import run_child\n"
+        "run_child(lambda _: print(gc.get_freeze_count()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=SECONDS, check=True
+    )
+    at_work, left, searched = (int(word) for word in done.stderr.split())
+    assert at_work == 0  # While it works, garbage is found.
+    assert left > 10_000 > 100 * searched
