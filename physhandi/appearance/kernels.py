@@ -11,7 +11,6 @@ pixel (`BLUR`), the least opacity that counts (`FAINT`), and the least light fro
 followed (`DARK`).
 """
 
-# Warp's types are no classes to a type checker.
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})

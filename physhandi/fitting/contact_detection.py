@@ -22,7 +22,7 @@ from physhandi.data.observation import ObjectObservation
 from physhandi.fitting.rest_state import node_distance
 from physhandi.fitting.search_bounds import neighbor_distance
 from physhandi.metrics.alignment import best_rotations
-from physhandi.metrics.baselines import last_residual
+from physhandi.metrics.baselines import last_residual, placed_tracks
 from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 
 NEAR_HAND, LONGEST_HOLD = 1.5, 4.0
@@ -193,14 +193,12 @@ def _told_nodes(
     spacing: float,
 ) -> Bool[ndarray, "frame node"]:
     """Tell which nodes have a track near them in a frame; at frame 0 all places are known."""
-    of_node = observation.node_of_track
-    anchor = observation.point[0] if of_node is None else node[of_node]
-    is_usable = observation.is_visible[:frame_count]
-    if of_node is None:
-        is_usable = is_usable & observation.is_visible[0]
+    is_placed, place = placed_tracks(
+        node, observation.point, observation.is_visible, observation.node_of_track
+    )
     away = np.full((frame_count, len(node)), np.inf)
-    for frame in np.flatnonzero(is_usable.any(axis=1)):
-        away[frame] = KDTree(anchor[is_usable[frame]]).query(node)[0]
+    for frame in np.flatnonzero(is_placed[:frame_count].any(axis=1)):
+        away[frame] = KDTree(place[is_placed[frame]]).query(node)[0]
     is_told = away <= np.maximum(EVIDENCE * spacing, FARTHER * away[0])
     is_told[0] = True
     return is_told

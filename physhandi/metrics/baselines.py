@@ -93,17 +93,15 @@ def last_residual(  # noqa: PLR0917  (the object at two times, then what was see
     Raises:
         ValueError: If the frame shows no track whose place on the object is known.
     """
-    is_usable = is_visible[frame]
-    if node_of_track is None:
-        is_usable = is_usable & is_visible[0]
+    start, now = start.astype(np.float64), now.astype(np.float64)
+    is_placed, place = placed_tracks(start, point, is_visible, node_of_track)
+    is_usable = is_placed[frame]
     if not is_usable.any():
         raise ValueError(f"frame {frame} shows no track that frame 0 places on the object")
-    start, now = start.astype(np.float64), now.astype(np.float64)
+    anchor = place[is_usable]
     if node_of_track is not None:
-        anchor = start[node_of_track[is_usable]]
         predicted = now[node_of_track[is_usable]]
     else:
-        anchor = point[0, is_usable].astype(np.float64)
         predicted = carried_points(anchor, np.stack([start, now]))[1]
     residual = point[frame, is_usable] - predicted
     tree: Any = KDTree(anchor)
@@ -112,3 +110,26 @@ def last_residual(  # noqa: PLR0917  (the object at two times, then what was see
     weight = 1.0 / (np.reshape(distance, (-1, count)) + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)
     return np.einsum("nc,nci->ni", weight, residual[np.reshape(near, (-1, count))])
+
+
+def placed_tracks(
+    start: Float[ndarray, "node 3"],
+    point: Float[ndarray, "frame track 3"],
+    is_visible: Bool[ndarray, "frame track"],
+    node_of_track: Int[ndarray, " track"] | None = None,
+) -> tuple[Bool[ndarray, "frame track"], Float[ndarray, "track 3"]]:
+    """Tell in which frames tracks show a known place of the object, and where that is in frame 0.
+
+    Args:
+        start: Nodes in frame 0 [m].
+        point: Observed tracks [m].
+        is_visible: Whether a track is visible.
+        node_of_track: Node that each track observes; None if its place is where it was seen in
+            frame 0, and not known if it was not.
+
+    Returns:
+        Whether a track is seen in a frame and its place is known, and the places [m].
+    """
+    if node_of_track is not None:
+        return is_visible, start[node_of_track]
+    return is_visible & is_visible[0], point[0].astype(np.float64)

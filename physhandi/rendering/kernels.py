@@ -7,7 +7,6 @@ number of a shape, so the order of threads does not matter. Products and sums st
 same bits on all processors.
 """
 
-# Warp's types are no classes to a type checker.
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
