@@ -3,6 +3,7 @@
 import errno
 import io
 import os
+import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +16,7 @@ import numpy as np
 from waiting import until
 
 from app.jobs.processes import processes_of
+from app.jobs.scheduler import ENDED
 from app.jobs.ticket import note_end
 from app.jobs.views import explain
 from physhandi.errors import PhysHandiError
@@ -30,6 +32,11 @@ CALLS: tuple[tuple[Any, str], ...] = (
 
 _STRIDE = 23
 """Calls between two that fail, so that few of them lie everywhere, and many are all of them."""
+
+_DISK = 2**21
+"""Size of a real disk [bytes]."""
+_MOST_PAGES = 24
+"""Pages that it may have left, besides none; a run that goes on takes about a dozen."""
 
 
 class Disk:
@@ -115,6 +122,50 @@ def break_disks(count: int, folder: Path) -> Report:
     return _fail((errno.EIO, errno.EROFS), count, folder)
 
 
+@contextmanager
+def small_disk(folder: Path) -> Iterator[Path]:
+    """Mount a disk of two megabytes in a folder; only root may."""
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={_DISK}", "none", folder], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+def fill_a_real_disk(count: int, folder: Path) -> Report:
+    """Leave a few pages of a disk while a fit is at work, and have it go on when there is room."""
+    counts: Counter[str] = Counter(lost=0, corrupt=0, wrong=0, orphans=0)
+    with (
+        small_disk(folder / "disk") as disk,
+        queue_in(disk, keep_free_gib=0.0) as scheduler,
+    ):
+        for number in range(count):
+            run = scheduler.launch(["sheet"], "quick", "wait")
+            until(lambda run=run: run.progress.get("stage") == "second", lambda run=run: run.error)
+            filling = disk / "filling"
+            pages = number % _MOST_PAGES
+            room = os.statvfs(disk)
+            filling.write_bytes(bytes(max(0, room.f_bavail - pages) * room.f_bsize))
+            (run.folder / "go").touch()
+            until(lambda run=run: state_of(scheduler, run) in ENDED)
+            until(lambda run=run: not list(processes_of(run.folder)))
+            counts["survived"] += run.is_published
+            counts["wrong"] += run.is_published != (state_of(scheduler, run) == "succeeded")
+            filling.unlink()
+            if not run.is_published:
+                is_told = os.strerror(errno.ENOSPC) in (run.error or "")
+                counts["told"] += is_told
+                counts["wrong"] += not is_told
+                scheduler.resume(run.id)
+                until(lambda run=run: state_of(scheduler, run) in ENDED)
+            counts["lost"] += state_of(scheduler, run) != "succeeded"
+            counts["corrupt"] += is_damaged(run)
+            until(lambda run=run: not list(processes_of(run.folder)))
+            scheduler.delete(run.id)
+    return {"done": count, **counts}
+
+
 def run_out_of_memory(count: int, folder: Path) -> Report:
     """Let fits end for want of memory or of their device, one after the other in one slot."""
     kinds = ("no_memory", "no_device_memory", "lost_device")
@@ -137,6 +188,7 @@ def run_out_of_memory(count: int, folder: Path) -> Report:
 
 CASES = {
     "R8": Case("The disk is full, or the quota, while a run is written", 200, 12, fill_disks),
+    "R8b": Case("A real disk has few pages left while a fit is at work", 200, 0, fill_a_real_disk),
     "R9": Case("A disk fails, or is read-only, while a run is written", 200, 12, break_disks),
     "R11": Case("Memory runs out, or the device is lost", 20, 0, run_out_of_memory),
 }
