@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Many
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from app.cli.suite_work import Piece, PieceWorker, fill_with, make_with, told_of
 from app.jobs.engines.following import FollowedRun, end_all
@@ -33,8 +33,10 @@ from physhandi.devices import describe_device
 from physhandi.errors import CancelledError, RunError, UsageError
 from physhandi.progress import Progress
 from physhandi.synthetic.code_version import PREDICTIONS, SCORES, code_version
-from physhandi.synthetic.suite.evaluation import Fill, Order
-from physhandi.synthetic.suite.suite import Making
+
+if TYPE_CHECKING:
+    from physhandi.synthetic.suite.evaluation import Fill, Order
+    from physhandi.synthetic.suite.suite import Making
 
 WORKER: Final = "app.cli.suite_jobs"
 _REQUEST, _ENVIRONMENT = "request.json", "environment.json"
@@ -85,11 +87,11 @@ class SuiteJobs:
                 raise RunError(f"No node could tell what it computes with. {lost}")
         return read_mapping(target)
 
-    def make(self, makings: Mapping[Path, Making]) -> None:
+    def make(self, makings: "Mapping[Path, Making]") -> None:
         """Make sequences of a suite; see `make_with`."""
         make_with(self._done, makings)
 
-    def fill(self, order: Order, out: Path) -> Fill:
+    def fill(self, order: "Order", out: Path) -> "Fill":
         """Give what fills the cells of an order; see `fill_with`."""
         return fill_with(self._done, order, out)
 

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from app.cli.suite_work import Piece, PieceWorker, fill_with, make_with, told_of
 from app.jobs.ticket import MOST_STARTS
@@ -22,8 +22,10 @@ from physhandi.child import Channel, Child, ChildEndedError, run_child
 from physhandi.devices import card_of, only_card
 from physhandi.errors import CancelledError
 from physhandi.progress import Progress
-from physhandi.synthetic.suite.evaluation import Fill, Order
-from physhandi.synthetic.suite.suite import Making
+
+if TYPE_CHECKING:
+    from physhandi.synthetic.suite.evaluation import Fill, Order
+    from physhandi.synthetic.suite.suite import Making
 
 _LISTEN_S = 0.2
 _TELL_EVERY_S = 0.5
@@ -71,11 +73,11 @@ class SuiteProcesses:
         for process in self._all:
             process.close()
 
-    def make(self, makings: Mapping[Path, Making]) -> None:
+    def make(self, makings: "Mapping[Path, Making]") -> None:
         """Make sequences of a suite; see `make_with`."""
         make_with(self._done, makings)
 
-    def fill(self, order: Order, out: Path) -> Fill:
+    def fill(self, order: "Order", out: Path) -> "Fill":
         """Give what fills the cells of an order; see `fill_with`."""
         return fill_with(self._done, order, out)
 

@@ -6,14 +6,16 @@ from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from physhandi.data.files import plain
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.progress import Progress
-from physhandi.synthetic.suite.evaluation import Fill, Order, Task, filler
-from physhandi.synthetic.suite.suite import Making, make_recording
+
+if TYPE_CHECKING:
+    from physhandi.synthetic.suite.evaluation import Fill, Order, Task
+    from physhandi.synthetic.suite.suite import Making
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +36,7 @@ Done = Callable[[str, Many[Piece]], Iterator[tuple[int, str]]]
 """Has pieces of a stage done; yields their numbers as they end, with a reason if one was lost."""
 
 
-def make_with(done: Done, makings: Mapping[Path, Making]) -> None:
+def make_with(done: Done, makings: "Mapping[Path, Making]") -> None:
     """Make sequences of a suite.
 
     Raises:
@@ -54,7 +56,7 @@ def make_with(done: Done, makings: Mapping[Path, Making]) -> None:
             raise RunError(f"Sequence '{pieces[number].label}' could not be made. {lost}")
 
 
-def fill_with(done: Done, order: Order, out: Path) -> Fill:
+def fill_with(done: Done, order: "Order", out: Path) -> "Fill":
     """Give what fills the cells of an order, for `evaluate_suite`.
 
     Args:
@@ -65,7 +67,7 @@ def fill_with(done: Done, order: Order, out: Path) -> Fill:
     place = str(out.resolve())
     about = {"order": order_to_json(order), "out": place}
 
-    def fill(tasks: Many[Task]) -> Iterator[tuple[int, str]]:
+    def fill(tasks: "Many[Task]") -> Iterator[tuple[int, str]]:
         pieces = [
             Piece(
                 number=number,
@@ -102,30 +104,37 @@ class PieceWorker:
         Raises:
             PhysHandiError: If it cannot be done.
         """
+        # What computes takes two seconds to import; not every process of a suite computes.
         if "make" in request:
+            from physhandi.synthetic.suite.suite import make_recording
+
             make_recording(request["make"], Path(request["target"]), self._progress)
             return
         asked = (request["order"], request["out"])
         if self._fill is None or self._order != asked:
+            from physhandi.synthetic.suite.evaluation import filler
+
             self._order = asked
             order = order_from_json(request["order"])
             self._fill = filler(order, Path(request["out"]), self._progress)
         self._fill(request["cell"])
 
 
-def order_to_json(order: Order) -> dict[str, Any]:
+def order_to_json(order: "Order") -> dict[str, Any]:
     """Write an order down for another process; recordings are named by their folders."""
     about = {field.name: getattr(order, field.name) for field in fields(order)}
     about |= {name: dict(about[name]) for name in ("settings", "environment")}
     return about | {"recordings": [str(r.folder.resolve()) for r in order.recordings]}
 
 
-def order_from_json(about: Mapping[str, Any]) -> Order:
+def order_from_json(about: Mapping[str, Any]) -> "Order":
     """Read an order that another process wrote down.
 
     Raises:
         SequenceError: If a recording is damaged or gone.
     """
+    from physhandi.synthetic.suite.evaluation import Order
+
     read = dict(about)
     read["recordings"] = tuple(Sequence.load(Path(folder)) for folder in about["recordings"])
     read |= {name: tuple(about[name]) for name in ("methods", "protocols", "search_seeds")}
@@ -139,7 +148,7 @@ def told_of(label: str, report: Mapping[str, Any]) -> str:
     return f"{label} {report['stage']}{share}"
 
 
-def in_order(tasks: Many[Task]) -> list[int]:
+def in_order(tasks: "Many[Task]") -> list[int]:
     """Order cells so that what others are made from comes first, method by method.
 
     Processes then seldom wait for each other.
@@ -155,7 +164,7 @@ def in_order(tasks: Many[Task]) -> list[int]:
     return sorted(range(len(tasks)), key=place)
 
 
-def _identity(task: Task, order: Order, out: str) -> list[Any]:
+def _identity(task: "Task", order: "Order", out: str) -> list[Any]:
     """Name what decides a cell, but not which other cells are wanted beside it."""
     recordings = [str(r.folder.resolve()) for r in (task.recording, task.fitted) if r is not None]
     method = [task.method.name, dict(task.method.overrides), dict(order.settings)]
