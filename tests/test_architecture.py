@@ -1,6 +1,7 @@
 """Rules about the tree that no linter knows."""
 
 import ast
+import gc
 import re
 import subprocess
 from collections import defaultdict
@@ -8,6 +9,8 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import TypeVar
+
+import pytest
 
 Node = TypeVar("Node", bound=ast.AST)
 ROOT = Path(__file__).parent.parent
@@ -32,6 +35,14 @@ Catalog Motion PARTS Part Raster Setting open_run plain rasterize reconstruct si
 triangle_areas vertex_normals
 """
 """Names that still have more than one meaning; the list only shrinks."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _look_for_no_garbage() -> Iterator[None]:
+    """Trees stay: looking for garbage among them takes longer than parsing."""
+    gc.disable()
+    yield
+    gc.enable()
 
 
 @cache
