@@ -126,7 +126,7 @@ KEYS: tuple[KeyGroup, ...] = (
             ),
             Key(
                 shown=("0",),
-                about="show the object as splats, as a surface, or as nodes",
+                about="show the object as a surface, as splats if it has some, or as nodes",
                 action="form",
                 hotkeys=("0",),
             ),

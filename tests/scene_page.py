@@ -250,16 +250,3 @@ def object_springs(node: np.ndarray, radius: float, most: int) -> set[tuple[int,
             if 1e-4 < row[second] < radius:
                 springs.add((min(first, int(second)), max(first, int(second))))
     return springs
-
-
-def virtual_springs(
-    control: np.ndarray, node: np.ndarray, radius: float, most: int
-) -> set[tuple[int, int]]:
-    """Join each control node to its `most` nearest object nodes below `radius`."""
-    distance = cdist(control, node)
-    return {
-        (int(second), len(node) + first)
-        for first, row in enumerate(distance)
-        for second in np.argsort(row, kind="stable")[:most]
-        if row[second] < radius
-    }

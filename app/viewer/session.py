@@ -156,6 +156,7 @@ class Session(SceneServer):
             "colors": self._colors.is_there,
             "figure": self._comparison.offers_figure,
             "recorded": any(view.has_color for view in self._content.views),
+            "splats": self._content.splats is not None,
             "video": default_layers(self._content).looks_from is not None,
         }
         return tuple(name for name, is_there in features.items() if is_there)

@@ -11,7 +11,8 @@ import psutil
 import pytest
 import yaml
 from playwright.sync_api import expect
-from scene_page import ScenePage, object_springs, virtual_springs
+from safetensors.numpy import load_file
+from scene_page import ScenePage, object_springs
 
 from app.jobs.processes import COOKIE
 from physhandi.run import Run
@@ -30,15 +31,18 @@ class Fitted:
     rest_node: np.ndarray
     object_node: np.ndarray
     control: np.ndarray
-    attachment: np.ndarray  # the controls when springs were laid, before stage 3
+    contacts: dict[str, np.ndarray]  # who held what, how far away, and as which of the nearest
     rollout: np.ndarray
 
     def object_springs(self, radius: float) -> set[tuple[int, int]]:
         return object_springs(self.rest_node, radius, self.parameters["max_neighbors"])
 
-    def virtual_springs(self, radius: float) -> set[tuple[int, int]]:
-        most = self.parameters["virtual_max_neighbors"]
-        return virtual_springs(self.attachment, self.object_node, radius, most)
+    def virtual_springs(self, radius: float) -> set[tuple[int, int, int]]:
+        """Springs of the whole sequence, and the frames in which they begin."""
+        held, most = self.contacts, self.parameters["virtual_max_neighbors"]
+        is_joined = (held["distance"] < radius) & (held["rank"] < most)
+        ends = held["node"], held["control"], held["interval"][:, 0]
+        return set(zip(*(end[is_joined].tolist() for end in ends), strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,7 @@ def fitted() -> Fitted:
         rest_node=np.load(run.out / "object" / "rest_node.npy").astype(np.float64),
         object_node=np.load(motion / "object_node.npy").astype(np.float64),
         control=np.load(motion / "control.npy").astype(np.float64),
-        attachment=np.load(motion / "attachment.npy").astype(np.float64),
+        contacts=load_file(motion / "contacts.safetensors"),
         rollout=np.load(motion / "rollout.npy"),
     )
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Error as PlaywrightError
+from playwright.sync_api import expect
 from scene_page import ScenePage
 from viewer_world import FolderCatalog
 
@@ -22,6 +23,8 @@ BUNDLED = Path(__file__).parents[2] / "sequences"
 FRAME, NODE = 30, 0
 PURPLE = (0.8, 0.0, 0.8)
 """A color that nothing of the scene has."""
+TEAL = (50, 136, 152)
+"""The towel's color in frame 0 of the recording."""
 
 
 def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
@@ -176,6 +179,11 @@ def purple(scene: ScenePage) -> int:
     return int(((red > 110) & (blue > 110) & (green < 70)).sum())
 
 
+def recorded(scene: ScenePage) -> int:
+    """Count the pixels that have the color which the recording shows of the towel."""
+    return int((np.abs(shot_of(scene) - TEAL) < 20).all(axis=-1).sum())
+
+
 @pytest.fixture(scope="module")
 def seen(own_server) -> Run:
     """The bundled run as one whose object has purple splats."""
@@ -200,7 +208,7 @@ def seen(own_server) -> Run:
     return run
 
 
-def test_a_scene_opens_on_the_splats_and_a_key_goes_on(context, own_server, seen) -> None:
+def test_a_scene_opens_on_the_surface_and_a_key_shows_splats(context, own_server, seen) -> None:
     home = context.new_page()
     home.goto(own_server.url)
     home.goto(f"{home.url.partition('?')[0].rstrip('/')}/runs/{seen.id}")
@@ -209,10 +217,12 @@ def test_a_scene_opens_on_the_splats_and_a_key_goes_on(context, own_server, seen
     scene = ScenePage(home)
     scene.until(lambda: scene.has("object springs"), "the panel appears")
     scene.pause()
-    scene.until(lambda: purple(scene) > 5_000, "the splats are drawn in their color")
+    scene.go(0)
+    scene.until(lambda: recorded(scene) > 5_000, "the surface has the color of the recording")
+    expect(home.locator("[data-first-hint]")).to_contain_text("0 shows splats")
     home.locator(".hints").click()
-    for form in ("surface", "nodes"):
+    press_and_see(scene, "0", "show")
+    scene.until(lambda: purple(scene) > 5_000, "the splats are drawn in their color")
+    for form in ("nodes", "surface"):
         press_and_see(scene, "0", "show")
         scene.until(lambda: purple(scene) < 50, f"the {form} has its own color")
-    press_and_see(scene, "0", "show")
-    scene.until(lambda: purple(scene) > 5_000, "the splats are drawn again")

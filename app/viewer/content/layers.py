@@ -80,7 +80,8 @@ def default_layers(content: Content) -> Layers:
     """Choose what is shown at first: the result if there is one, else the recording.
 
     Nodes and springs would hide what an object looks like, and come in its place if nothing tells
-    that. Splats tell it best.
+    that. Splats have the light of the recording in them: they agree with its pictures, but show no
+    folds from elsewhere, and come first only where no surface could be laid.
     Hands without an object are seen as the first camera with a picture saw them, before it.
     """
     has_object = content.fitted is not None
@@ -89,8 +90,8 @@ def default_layers(content: Content) -> Layers:
     seen_from = [view.name for view in content.views if view.has_color]
     is_before_video = bool(content.hands and seen_from) and not has_object
     return Layers(
-        surface=has_surface and not has_splats,
-        splats=has_splats,
+        surface=has_surface,
+        splats=has_splats and not has_surface,
         nodes=not has_look,
         controls=not has_look,
         virtual_springs=not has_look,
@@ -111,8 +112,8 @@ def with_surface_for_splats(layers: Layers) -> Layers:
 def next_form(layers: Layers, content: Content) -> ObjectForm:
     """Find as what the object is to be shown after what it is shown as now."""
     forms: list[tuple[ObjectForm, bool]] = [
-        ("splats", content.splats is not None),
         ("surface", content.surface is not None),
+        ("splats", content.splats is not None),
         ("nodes", True),
     ]
     order: list[ObjectForm] = [form for form, is_there in forms if is_there]

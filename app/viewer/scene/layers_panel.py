@@ -75,8 +75,8 @@ def legend_of(content: Content, layers: Layers) -> str:
 
 _OVERVIEW = "Overview"
 _HINTS = {
-    "splats": "The object as the cameras saw it. Where colors mean a quantity, and in comparisons, "
-    "its surface is shown in their place"
+    "splats": "The object as the cameras saw it, best before their video (View from); key 0. Where "
+    "colors mean a quantity, and in comparisons, its surface is shown in their place"
 }
 
 

@@ -11,8 +11,10 @@ from splat_world import splats_on, splats_seen
 from viewer_client import ViewerClient
 from viewer_world import FolderCatalog, hear_all, make_run, rest_at, sheet
 
+from app.exports.permalink import state_from_query
 from app.viewer.content.content import open_run
 from app.viewer.content.layers import default_layers, next_form
+from app.viewer.content.session_state import SessionState
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.scene.splat_groups import MOST_GROUPS, SplatGroups
@@ -92,12 +94,17 @@ def test_more_groups_lose_less_of_a_bend() -> None:
     assert lost[2] < 0.0012
 
 
-def test_a_scene_opens_on_the_splats_and_moves_them(sessions, run, catalog) -> None:
+def test_a_scene_opens_on_the_surface_and_moves_splats_that_a_link_asks_for(
+    sessions, run, catalog
+) -> None:
     position = run.array("sequences/lift/rollout.npy")
     splats = splats_on(sheet())
     session = sessions.get(sessions.open("run", "seen", "me"))
     layers = session._view.scene.layers
-    assert (layers.splats, layers.surface, layers.nodes) == (True, False, False)
+    assert (layers.splats, layers.surface, layers.nodes) == (False, True, False)
+    assert "splats" in session.offers
+    assert "splats" not in sessions.get(sessions.open("run", "sheet", "me")).offers
+    session = sessions.get(sessions.open("run", "seen", "me", state=as_splats()))
     with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
         rest_at(client, 17)
         # Of both messages that move a group, its place comes last.
@@ -117,6 +124,12 @@ def test_a_scene_opens_on_the_splats_and_moves_them(sessions, run, catalog) -> N
         np.testing.assert_allclose(color, splats.color[which], atol=1 / 255)
 
 
+def as_splats() -> SessionState:
+    """What a link to splats asks for."""
+    state = state_from_query({"show": "hands,splats,ground"})
+    return replace(state, is_playing=True)
+
+
 def distances(point: np.ndarray, other: np.ndarray) -> np.ndarray:
     """How far every point is from every other one."""
     return np.linalg.norm(point[:, None] - other[None], axis=-1)
@@ -125,7 +138,7 @@ def distances(point: np.ndarray, other: np.ndarray) -> np.ndarray:
 def test_a_key_goes_through_what_an_object_is_shown_as(sessions) -> None:
     session = sessions.get(sessions.open("run", "seen", "me"))
     layers = session._view.scene.layers
-    parts = ("/object/splats", "/object/surface", "/object/nodes")
+    parts = ("/object/surface", "/object/splats", "/object/nodes")
     with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
         rest_at(client, 5)
         client.until(lambda: drawn(client, parts) == {parts[0]})
@@ -135,9 +148,9 @@ def test_a_key_goes_through_what_an_object_is_shown_as(sessions) -> None:
             client.send("CommandTriggerMessage", uuid=commands(client)["0"])
             client.until(lambda part=part: drawn(client, parts) == {part})
             seen.append((layers.splats, layers.surface, layers.nodes))
-        assert seen == [(False, True, False), (False, False, True), (True, False, False)]
+        assert seen == [(True, False, False), (False, False, True), (False, True, False)]
         labels = ("Splats", "Surface", "Object nodes")
-        client.until(lambda: [client.value(label) for label in labels] == [True, False, False])
+        client.until(lambda: [client.value(label) for label in labels] == [False, True, False])
 
 
 def drawn(client: ViewerClient, parts: tuple[str, ...]) -> set[str]:
@@ -156,7 +169,7 @@ def commands(client: ViewerClient) -> dict[str, str]:
 
 def test_the_surface_stands_for_splats_where_colors_mean_something(sessions) -> None:
     parts = ("/object/splats", "/object/surface")
-    session = sessions.get(sessions.open("run", "seen", "me"))
+    session = sessions.get(sessions.open("run", "seen", "me", state=as_splats()))
     with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
         rest_at(client, 9)
         client.until(lambda: drawn(client, parts) == {"/object/splats"})
@@ -173,10 +186,13 @@ def test_what_comes_next_is_what_there_is(catalog) -> None:
     content = open_run(catalog, "seen")
     layers = default_layers(content)
     bare = replace(content, splats=None)
-    assert next_form(layers, content) == "surface"
+    assert next_form(layers, content) == "splats"
     assert next_form(default_layers(bare), bare) == "nodes"
-    assert next_form(replace(layers, splats=False), content) == "splats"
-    assert next_form(replace(layers, splats=False), replace(bare, surface=None)) == "nodes"
+    assert next_form(replace(layers, surface=False, splats=True), content) == "nodes"
+    assert next_form(replace(layers, surface=False), content) == "surface"
+    flat = replace(content, surface=None)
+    assert (default_layers(flat).splats, default_layers(flat).nodes) == (True, False)
+    assert next_form(replace(layers, surface=False), replace(bare, surface=None)) == "nodes"
 
 
 def test_a_playing_frame_of_many_splats_is_small(server, catalog) -> None:
@@ -185,6 +201,7 @@ def test_a_playing_frame_of_many_splats_is_small(server, catalog) -> None:
     take = content.fitted
     assert take is not None
     scene = SceneDrawing(server, content, frame_content(content))
+    scene.layers.splats, scene.layers.surface = True, False
     scene.draw(0, take, 0, is_playing=True)
     with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
         hear_all(server, client)

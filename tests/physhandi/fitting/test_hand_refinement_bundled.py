@@ -165,7 +165,10 @@ def control_of(motion: HandMotion) -> np.ndarray:
 def fitted_until_refinement(run: Run, folder: Path) -> Run:
     """A run like the bundled one was before stage 3, with the hands of stage 1."""
     config = PipelineConfig.from_dict(run.config["profile"])
-    config = config.replace(refinement=config.refinement.replace(iterations=6)).to_dict()
+    config = config.replace(
+        refinement=config.refinement.replace(iterations=6),
+        appearance=config.appearance.replace(enabled=False),
+    ).to_dict()
     later = Run.create(
         folder,
         name="later",
