@@ -71,17 +71,25 @@
     viewer.requestRender();
   }
 
-  /* Without a graphics card the three maps of shadows are half of what a picture costs. */
+  /* viser's lamps alone show a surface brighter than its color. This much of them, and the server's light from all around, show that color.
+     Without a graphics card the three maps of shadows are half of what a picture costs. */
+  const LIGHT = 0.32;
+  const dimmed = new WeakSet();
   let isSlow = null;
 
-  function dropShadows(viewer) {
+  function light(viewer) {
     if (!viewer.canvas || !viewer.scene) return;
     if (isSlow === null) {
       const context = viewer.canvas.getContext("webgl2");
       const named = context?.getExtension("WEBGL_debug_renderer_info");
       isSlow = Boolean(named) && SOFTWARE.test(context.getParameter(named.UNMASKED_RENDERER_WEBGL));
     }
-    if (isSlow) for (const part of viewer.scene.children) if (part.isLight) part.castShadow = false;
+    for (const part of viewer.scene.children) {
+      if (!part.isLight) continue;
+      if (isSlow) part.castShadow = false;
+      if (!dimmed.has(part)) part.intensity *= LIGHT;
+      dimmed.add(part);
+    }
   }
 
   const painted = new Set();
@@ -90,7 +98,7 @@
     requestAnimationFrame(follow);
     const [tree, viewer] = [window.__viserSceneTree, window.__viserMutable];
     if (!tree || !viewer) return;
-    dropShadows(viewer);
+    light(viewer);
     if (isRecording) keepSides(viewer);
     let [isChanged, hasContent] = [false, false];
     for (const [name, node] of Object.entries(tree.getState())) {

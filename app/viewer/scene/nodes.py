@@ -74,8 +74,9 @@ class SceneNodes:
         node: Any = self._nodes.get(name)
         if is_visible:
             if node is None:
+                # Coarse maps of shadows put whole surfaces into a shadow of their own.
                 node = self._nodes[name] = self._scene.add_mesh_simple(
-                    name, vertex, face, opacity=opacity, side="double"
+                    name, vertex, face, opacity=opacity, side="double", receive_shadow=False
                 )
             node.vertices, node.faces = vertex, np.asarray(face, dtype=np.uint32)
             node.opacity = opacity
