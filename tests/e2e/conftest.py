@@ -37,7 +37,7 @@ ROOT = Path(__file__).parents[2]
 BELOW = "/lab/physhandi"
 """Path below which the servers of these tests serve, as behind a proxy."""
 START = "from app.cli import main; main()"
-_CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist", *LESS_DRAWING]
+_CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
 _VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
 _STILL: Literal["reduce"] = "reduce"
 """What moves for decoration alone is drawn sixty times a second, by software; a test that is about
@@ -170,7 +170,9 @@ def browser(playwright_driver: Playwright) -> Iterator[Browser]:
         reason = "needs Debian's chromium with libegl-mesa0 and libgl1-mesa-dri"
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     browser = playwright_driver.chromium.launch(
-        executable_path=executable, args=_CHROMIUM, timeout=TIMEOUT_MS
+        executable_path=executable,
+        args=_CHROMIUM + ([] if os.environ.get(_PICTURES) else [*LESS_DRAWING]),
+        timeout=TIMEOUT_MS,
     )
     yield browser
     browser.close()
@@ -312,6 +314,6 @@ def picture() -> Callable[[Page, str], None]:
         expect(page.locator(".shot.pending:not(:has(img))")).to_have_count(0)
         page.wait_for_timeout(_SETTLE_MS)
         image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-        image.quantize(160).save(Path(folder) / f"{name}.png", optimize=True)
+        image.save(Path(folder) / f"{name}.webp", quality=88, method=6)
 
     return keep

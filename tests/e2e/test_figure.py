@@ -50,7 +50,9 @@ def test_the_figure_shows_both_topologies_in_one_picture(
     # The object is the same on both sides.
     assert min(object_nodes) > 2_000
     assert max(object_nodes) < 2 * min(object_nodes)
-    assert min(virtual_springs) > 500
+    # Ours are a fifth as long and half as many.
+    assert virtual_springs[0] > 100
+    assert virtual_springs[1] > 500
     scene.tab("Play")
     scene.press("Back to the scene")
     scene.until(lambda: scene.has("Compare with PhysTwin"), "the scene")

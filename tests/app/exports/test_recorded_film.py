@@ -127,8 +127,9 @@ def test_what_makes_no_sense_is_refused(
 def test_without_its_recording_a_run_is_not_filmed_so(content: Content, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is not there or has no pictures"):
         film(replace(content, views=()), tmp_path / "a.mp4", {}, beside="recording")
+    bare = replace(content, surface=None, splats=None)
     with pytest.raises(UsageError, match="neither splats nor a surface"):
-        film(replace(content, surface=None), tmp_path / "a.mp4", {}, beside="recording")
+        film(bare, tmp_path / "a.mp4", {}, beside="recording")
 
 
 def test_a_browser_asks_for_such_a_film(world: World, made: list[FileRequest]) -> None:
