@@ -63,6 +63,12 @@ def truth() -> HandMotion:
 
 
 @pytest.fixture(scope="module")
+def disturbed(truth: HandMotion) -> dict[float, HandMotion]:
+    """The hand with an error of `ERROR`, by the error's width in time [frames]."""
+    return {w: with_error(truth, ERROR, 0, width=w, frames=FITTED) for w in (6.0, 0.0)}
+
+
+@pytest.fixture(scope="module")
 def run() -> Run:
     return Run.open(SEQUENCES / "runs" / "towel_fold_quick")
 
@@ -102,8 +108,10 @@ def test_the_true_hand_is_the_one_that_was_filmed(run: Run, truth: HandMotion) -
 
 
 @pytest.mark.parametrize("width", [6.0, 0.0])
-def test_the_injected_error_has_the_size_that_it_says(truth: HandMotion, width: float) -> None:
-    wrong = with_error(truth, ERROR, 0, width=width, frames=FITTED)
+def test_the_injected_error_has_the_size_that_it_says(
+    truth: HandMotion, disturbed: dict[float, HandMotion], width: float
+) -> None:
+    wrong = disturbed[width]
     assert mpjpe(wrong, truth, FITTED) == pytest.approx(ERROR, rel=1e-4)
     change = np.diff(wrong.wrist_translation - truth.wrist_translation, axis=0)
     jump = np.linalg.norm(change, axis=1).mean()
@@ -114,9 +122,9 @@ def test_the_injected_error_has_the_size_that_it_says(truth: HandMotion, width: 
 @pytest.mark.no_cover  # test_hand_refinement.py goes through the same lines.
 @WIDTHS
 def test_a_third_of_a_random_hand_error_is_recovered(
-    run: Run, truth: HandMotion, width: float
+    run: Run, truth: HandMotion, disturbed: dict[float, HandMotion], width: float
 ) -> None:
-    wrong = with_error(truth, ERROR, 0, width=width, frames=FITTED)
+    wrong = disturbed[width]
     result = refine(run, wrong)
     right = result.motions[0]
     assert mpjpe(right, truth, FITTED) < 0.7 * mpjpe(wrong, truth, FITTED)
@@ -128,7 +136,11 @@ def test_a_third_of_a_random_hand_error_is_recovered(
 @pytest.mark.no_cover  # test_hand_refinement.py goes through the same lines.
 @WIDTHS
 def test_without_gradients_through_the_simulator_nothing_is_recovered(
-    run: Run, truth: HandMotion, width: float, monkeypatch: pytest.MonkeyPatch
+    run: Run,
+    truth: HandMotion,
+    disturbed: dict[float, HandMotion],
+    width: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rollout = hand_refinement.differentiable.rollout
 
@@ -137,7 +149,7 @@ def test_without_gradients_through_the_simulator_nothing_is_recovered(
         return node.detach() + 0.0 * args[2].sum(), velocity.detach()
 
     monkeypatch.setattr(hand_refinement.differentiable, "rollout", blind)
-    wrong = with_error(truth, ERROR, 0, width=width, frames=FITTED)
+    wrong = disturbed[width]
     # With gradients, 10 iterations recover three tenths already.
     right = refine(run, wrong, FREE.replace(iterations=10)).motions[0]
     assert mpjpe(right, truth, FITTED) > 0.95 * mpjpe(wrong, truth, FITTED)
