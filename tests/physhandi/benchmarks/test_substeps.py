@@ -50,7 +50,7 @@ def test_the_towel_stays_within_a_millimetre_of_the_reference(device):
 def test_the_towel_diverges_beyond_the_limit_of_stability(device):
     model, parameters, control = bundled()
     limit = stable_substeps(model, parameters, control[0], safety=1.0)
-    few = int(0.75 * limit)
+    few = int(0.6 * limit)  # The estimate is a bound, below which a mode has to grow in time.
     with pytest.raises(SimulationDivergedError):
         benchmark_substeps(model, parameters, control, name="towel", device=device, substeps=(few,))
 
