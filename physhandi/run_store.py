@@ -32,6 +32,7 @@ from physhandi.data.run_folder import (
     inside,
 )
 from physhandi.errors import PhysHandiError, RunError, UsageError, describe
+from physhandi.typed import decode_json
 
 _BEAT_S = 5.0
 
@@ -155,7 +156,7 @@ class RunStore:
     def _listed(self, place: str, attempt: str) -> Iterator[str]:
         """Name the files of a published run below its place."""
         name = f"{attempt}/{MANIFEST}"
-        content = msgspec.json.decode(self._files.cat_file(f"{place}/{name}"))
+        content = decode_json(self._files.cat_file(f"{place}/{name}"), Any)
         manifest = checked(content, ManifestFile, name)
         yield from (JOB, RUN, CURRENT, name)
         if self._files.exists(f"{place}/{attempt}/{STAGES_FILE}"):

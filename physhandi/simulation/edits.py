@@ -20,6 +20,7 @@ from physhandi.settings import Finite
 from physhandi.simulation.contact_intervals import NEVER
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.typed import convert, decode_json
 
 MOST_EDITS = 1000
 """Edits that an object may have."""
@@ -171,7 +172,7 @@ class Release(EditOfNodes, frozen=True, kw_only=True, tag="release"):
 AnyEdit = ScaleMaterial | Cut | Join | Pin | Attach | Release
 Edits = tuple[AnyEdit, ...]
 """Edits in the order in which they are applied."""
-_CHECKED = Annotated[Edits, Meta(max_length=MOST_EDITS)]
+_CHECKED: Any = Annotated[Edits, Meta(max_length=MOST_EDITS)]
 
 
 def apply_edits(
@@ -219,7 +220,7 @@ def checked_edits(edits: Sequence[Edit]) -> Edits:
         UsageError: If a value is of the wrong kind or out of bounds; says where.
     """
     try:
-        return msgspec.convert(msgspec.to_builtins(list(edits)), _CHECKED)
+        return convert(msgspec.to_builtins(list(edits)), _CHECKED)
     except (msgspec.ValidationError, TypeError, ValueError) as error:
         raise UsageError(f"These are no edits: {error}.") from None
 
@@ -240,7 +241,7 @@ def decode_edits(content: bytes, where: str) -> Edits:
         UsageError: If something in it is wrong; names the place in it.
     """
     try:
-        return msgspec.json.decode(content, type=_CHECKED)
+        return decode_json(content, _CHECKED)
     except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
         kinds = ", ".join(str(kind.__struct_config__.tag) for kind in get_args(AnyEdit))
         raise UsageError(

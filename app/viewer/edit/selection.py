@@ -15,6 +15,7 @@ from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.edits import NodePair
 from physhandi.simulation.model import SpringMassModel
+from physhandi.typed import decode_json
 
 SelectKind = Literal["nodes", "springs", "virtual springs"]
 """What a shape selects."""
@@ -313,7 +314,7 @@ class DrawnShape(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if len(text) > MOST_SHAPE_BYTES:
             raise UsageError(f"A shape has at most {MOST_SHAPE_BYTES} bytes, not {len(text)}.")
         try:
-            return msgspec.json.decode(text, type=cls)
+            return decode_json(text, cls)
         except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
             raise UsageError(f"This is no shape: {error}.") from error
 

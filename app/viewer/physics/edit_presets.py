@@ -15,6 +15,7 @@ from physhandi.data.files import write_bytes
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.edits import Edits, apply_edits, decode_edits, encode_edits
+from physhandi.typed import decode_json
 
 EDIT_PRESET_FORMAT = "physhandi-edit-preset/1"
 _TAKEN = frozenset({AS_FITTED, BY_HAND})
@@ -151,7 +152,7 @@ class EditPresetStore(KeptFiles[EditPreset]):
         if path.stat().st_size > _MOST_BYTES:
             raise UsageError(f"it has more than {_MOST_BYTES >> 20} MiB. Keep fewer edits in one.")
         try:
-            stored = msgspec.json.decode(path.read_bytes(), type=_Stored)
+            stored = decode_json(path.read_bytes(), _Stored)
         except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
             raise UsageError(
                 f"it holds no preset of edits: {error}. Expected the fields of "

@@ -16,6 +16,7 @@ from numpy import ndarray
 
 from app.viewer.content.session_state import Pose
 from physhandi.errors import UsageError
+from physhandi.typed import decode_json
 
 MOST_LETTERS = 1_000
 """Longest message of a page."""
@@ -186,7 +187,7 @@ class KeyChannel:
         if len(text) > MOST_LETTERS:
             raise UsageError(f"A message has at most {MOST_LETTERS} letters, not {len(text)}.")
         try:
-            message = msgspec.json.decode(text, type=_FromPage)
+            message = decode_json(text, _FromPage)
         except (msgspec.DecodeError, UnicodeError) as error:
             raise UsageError(
                 f'This is no message: {error}. Expected {{"held": ["KeyW", …]}} with keys among '

@@ -15,6 +15,7 @@ from bundled_sequence import FRAME_RATE
 from refinement_world import mpjpe, mpvpe, with_error
 
 from physhandi import pipeline
+from physhandi.data.layout import SPLATS_FILE
 from physhandi.errors import CancelledError
 from physhandi.fitting import artefacts, hand_refinement
 from physhandi.fitting.config import PipelineConfig
@@ -193,6 +194,8 @@ def fitted_until_refinement(run: Run, folder: Path) -> Run:
     attempt = later.begin_attempt()
     for path in run.out.rglob("*.*"):
         rel = path.relative_to(run.out).as_posix()
+        if rel == SPLATS_FILE:
+            continue  # Its pictures would be drawn and compared.
         if rel.startswith("object/") or f"{folder}/observation" in rel or path.name in KEPT:
             (attempt.out / rel).parent.mkdir(parents=True, exist_ok=True)
             (attempt.out / rel).write_bytes(path.read_bytes())
