@@ -28,7 +28,7 @@ import numpy as np
 from msgspec import Meta
 
 from physhandi.errors import SettingsError
-from physhandi.typed import convert
+from physhandi.typed import to_typed
 
 LARGEST_NUMBER = 1e30
 """Larger numbers, squared or multiplied, leave the simulator's float32; no setting exceeds it."""
@@ -69,7 +69,7 @@ class Field:
     def problem_of(self, value: Any) -> str:
         """Say what a value ought to be if it is wrong; empty if it is right."""
         try:
-            convert(value, self.type)
+            to_typed(value, self.type)
         except msgspec.ValidationError:
             return self.wanted
         return ""
@@ -127,7 +127,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             given = getattr(self, field.name)
             value = given.item() if isinstance(given, np.generic) else given
             try:
-                value = convert(value, field.type)
+                value = to_typed(value, field.type)
             except msgspec.ValidationError:
                 problems[field.name] = _wrong(field.name, given, field.wanted)
             else:
@@ -161,7 +161,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                 of bounds; names all of them by their paths.
         """
         try:
-            return convert(values, cls)
+            return to_typed(values, cls)
         except (msgspec.ValidationError, SettingsError) as error:
             raise SettingsError(problems_in(cls, values, "") or {"": f"{error}"}) from None
 
@@ -276,7 +276,7 @@ def _problems_between(kind: type[Settings], values: Any, path: str) -> dict[str,
     """Find what a class of settings itself refuses, when each field is right alone."""
     at = f"{path}." if path else ""
     try:
-        convert(values, kind)
+        to_typed(values, kind)
     except SettingsError as error:
         return {
             f"{at}{name}" if name else path: told if name or not path else f"{path}: {told}"

@@ -16,7 +16,7 @@ _LOCK = threading.RLock()
 """Held again by classes that read while they are made, as settings do."""
 
 
-def convert(content: Any, kind: type[Typed]) -> Typed:
+def to_typed(content: Any, kind: type[Typed]) -> Typed:
     """Make typed objects of plain data, as JSON and YAML give it.
 
     Args:

@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 
 from physhandi.data.files import named_fields, parse_yaml, require_plain, require_shallow
 from physhandi.errors import RunError, UsageError, describe
-from physhandi.typed import convert, decode_json
+from physhandi.typed import decode_json, to_typed
 
 RUN_FORMAT = "physhandi-run/1"
 SAFE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -251,7 +251,7 @@ def checked(content: Any, kind: type[Checked], where: object) -> Checked:
         RunError: If a field is missing or wrong; names file and field.
     """
     try:
-        convert(content, kind)
+        to_typed(content, kind)
     except (msgspec.ValidationError, RecursionError) as error:
         raise RunError(f"{where} is damaged: {_told(str(error))}.") from None
     return cast("Checked", content)

@@ -20,7 +20,7 @@ from physhandi.settings import Finite
 from physhandi.simulation.contact_intervals import NEVER
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.typed import convert, decode_json
+from physhandi.typed import decode_json, to_typed
 
 MOST_EDITS = 1000
 """Edits that an object may have."""
@@ -220,7 +220,7 @@ def checked_edits(edits: Sequence[Edit]) -> Edits:
         UsageError: If a value is of the wrong kind or out of bounds; says where.
     """
     try:
-        return convert(msgspec.to_builtins(list(edits)), _CHECKED)
+        return to_typed(msgspec.to_builtins(list(edits)), _CHECKED)
     except (msgspec.ValidationError, TypeError, ValueError) as error:
         raise UsageError(f"These are no edits: {error}.") from None
 

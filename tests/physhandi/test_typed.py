@@ -8,12 +8,12 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from physhandi.typed import convert, decode_json
+from physhandi.typed import decode_json, to_typed
 
 AT_ONCE = """
 import dataclasses, sys, threading, typing
 import msgspec
-from physhandi.typed import convert, decode_json
+from physhandi.typed import decode_json, to_typed
 
 sys.setswitchinterval(1e-6)
 NUMBER = typing.Annotated[float, msgspec.Meta(ge=0)]
@@ -32,7 +32,7 @@ for number in range(60):
 
     def go(by_text):
         begin.wait()
-        read.append(decode_json(text, kind) if by_text else convert(content, kind))
+        read.append(decode_json(text, kind) if by_text else to_typed(content, kind))
 
     threads = [threading.Thread(target=go, args=(n % 2,)) for n in range(8)]
     for thread in threads:
@@ -56,9 +56,9 @@ class Chair(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def test_what_is_wrong_is_told_as_msgspec_tells_it() -> None:
-    assert convert({"legs": 4}, Chair).legs == decode_json(b'{"legs": 4}', Chair).legs == 4
+    assert to_typed({"legs": 4}, Chair).legs == decode_json(b'{"legs": 4}', Chair).legs == 4
     with pytest.raises(msgspec.ValidationError, match=r"`int` >= 3 - at `\$.legs`"):
-        convert({"legs": 2}, Chair)
+        to_typed({"legs": 2}, Chair)
     with pytest.raises(msgspec.ValidationError, match="missing required field `legs`"):
         decode_json("{}", Chair)
     with pytest.raises(msgspec.DecodeError, match="malformed"):
