@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from threading import Thread
 from typing import Any
 from unittest.mock import patch
@@ -31,7 +32,9 @@ class MadeCluster:
     """What it answers in the place of everything."""
     token: str = TOKEN
     executes: bool = False
-    """Whether jobs are processes of this machine, at once, and their status is theirs."""
+    """Whether jobs are processes of this machine, and their status is theirs."""
+    gate: Path | None = None
+    """File for which jobs that are submitted from now on wait; None for nothing."""
     processes: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
 
     @property
@@ -67,8 +70,9 @@ class MadeCluster:
             self.submitted.append(content)
             self.jobs[job] = {"status": "PENDING", "metadata": content["metadata"]}
             if self.executes:
+                wait = f"until [ -e '{self.gate}' ]; do sleep 0.02; done; " if self.gate else ""
                 self.processes[job] = subprocess.Popen(
-                    ["bash", "-c", content["entrypoint"]], start_new_session=True
+                    ["bash", "-c", wait + content["entrypoint"]], start_new_session=True
                 )
             return None if self.silence == "submit" else (200, {"submission_id": job})
         job, _, deed = name.partition("/")

@@ -139,14 +139,22 @@ def test_a_wish_that_makes_no_sense_makes_no_run(
 
 
 def test_a_fit_whose_node_is_lost_is_started_again_once_and_published_once(
-    cluster: MadeCluster, engine: RayEngine, make: Callable[[str], Run]
+    cluster: MadeCluster, engine: RayEngine, make: Callable[[str], Run], tmp_path: Path
 ) -> None:
     run = make("wait")
 
-    progress = Deeds(second=lambda: cluster.kill(cluster.submitted[-1]["submission_id"]))
+    def lose() -> None:
+        # The second start waits until it was told why there is one.
+        cluster.gate = tmp_path / "gate"
+        cluster.kill(cluster.submitted[-1]["submission_id"])
+
+    progress = Deeds(second=lose)
+    lost = "its job on the cluster has ended as FAILED. It was started again (2 of 2)."
     with FollowedRun(run.folder, engine) as followed:
         while not followed.look():
             progress.report(followed.report()["stage"])
+            if lost in progress.told[-1]:
+                (tmp_path / "gate").touch()
             if run.attempt == 2:
                 finish(run)
             engine.refresh()
@@ -156,7 +164,6 @@ def test_a_fit_whose_node_is_lost_is_started_again_once_and_published_once(
     assert len(list(run.folder.glob("attempts/*/MANIFEST.json"))) == 1
     # What was finished before the loss was taken over.
     assert run.json("first.json") == {"attempt": 1}
-    lost = "its job on the cluster has ended as FAILED. It was started again (2 of 2)."
     assert any(lost in stage for stage in progress.told)
 
 
