@@ -95,7 +95,8 @@ class MadeCluster:
         process = self.processes[job]
         if process.poll() is None:
             family = psutil.Process(process.pid).children(recursive=True)
-            for member in (*family, process):
+            # What watches the others goes first, or it would still tell that they were killed.
+            for member in (process, *family):
                 with suppress(psutil.NoSuchProcess, ProcessLookupError):
                     member.kill()
             until(lambda: all(_has_ended(member) for member in family))

@@ -215,10 +215,10 @@ def test_a_command_that_was_killed_is_followed_by_the_next_one_which_starts_noth
         until(lambda: not followed.look() and followed.report()["stage"] == "second")
         with pytest.raises(RunError, match="is followed by another process"):
             FollowedRun(run.folder, engine, patience_s=0.0)
-    finish(run)
     later = RayEngine.of(read_settings(engine=cluster.address), WORKER)
     later.refresh()
     with FollowedRun(run.folder, later) as followed:
+        finish(run)
         follow_to_end(followed, later, Deeds(), 0.1)
     assert (run.state, run.attempt, len(cluster.submitted)) == ("succeeded", 1, 1)
 

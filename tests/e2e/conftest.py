@@ -52,10 +52,13 @@ _REPORT_VIOLATIONS = (
 )
 
 _HARMLESS = (
+    "htmx:afterRequest",
+    "htmx:sendAbort",
     "Tried to update non-existent component",
     "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN",
 )
-"""What viser's browser says where a change of a control and its removal arrive for one picture: it
+"""What htmx says of a request that ends since its page is left (of one that fails it says more).
+What viser's browser says where a change of a control and its removal arrive for one picture: it
 removes at once and changes at the end. A change after the removal is refused by viser's server.
 And what it says of every scene with splats: each is drawn on a square whose corners have two
 coordinates (its `GaussianSplatsHelpers.ts`), whatever splats are sent."""
