@@ -4,7 +4,7 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -55,9 +55,9 @@ def children() -> list[psutil.Process]:
 class Watched(Progress):
     """Remembers what it is told, and asks to stop when some words are among it."""
 
-    def __init__(self) -> None:
+    def __init__(self, stop_at: str = "") -> None:
         self.told: list[tuple[str, int, int, str]] = []
-        self.stop_at = ""
+        self._stop_at = stop_at
 
     def report(
         self,
@@ -70,30 +70,24 @@ class Watched(Progress):
         self.told.append((stage, iteration, total, message))
 
     def check_cancelled(self) -> None:
-        if self.stop_at and any(self.stop_at in message for *_, message in self.told):
+        if self._stop_at and any(self._stop_at in message for *_, message in self.told):
             raise CancelledError("stopped")
 
 
-def test_two_processes_give_the_table_of_one_and_a_wish_to_stop_ends_them(
+def test_two_processes_give_the_table_of_one_fill_each_cell_once_and_tell_what_is_wrong(
     tmp_path: Path, order: Order
 ) -> None:
     evaluate_suite(order, tmp_path / "one")
     progress = Watched()
-    out, stopped = tmp_path / "two", tmp_path / "stopped"
     with SuiteProcesses(2, progress) as workers:
+        out = tmp_path / "two"
         found = evaluate_suite(order, out, progress, fill=workers.fill(order, out))
         shares = [process.cpu_affinity() for process in children()]
         assert sorted(shares) == suite_processes._shares(2)
-        told = list(progress.told)
-        refuse_in_its_words(workers, order, tmp_path)
-        progress.told.clear()
-        progress.stop_at = "quick, low"
-        fill = workers.fill(order, stopped)
-        with pytest.raises(CancelledError):
-            evaluate_suite(order, stopped, progress, fill=fill)
-        assert len(children()) == 2
-    assert children() == []
+        told_last = progress.told[-1]
+        refuse_in_their_words(workers, order, tmp_path)
     assert (found["cells"], found["failed"], found["skipped"]) == (CELLS, 0, [])
+    assert children() == []
     one, two = table(tmp_path / "one"), table(out)
     assert list(one) == list(two)
     for key, row in one.items():
@@ -104,30 +98,21 @@ def test_two_processes_give_the_table_of_one_and_a_wish_to_stop_ends_them(
     names = [sorted(p.name for p in (tmp_path / n / "cells").iterdir()) for n in ("one", "two")]
     assert names[0] == names[1]
     assert {Run.open(out / "cells" / name).attempt for name in names[1]} == {1}
-    assert told[-1][:3] == ("suite", CELLS, CELLS)
-    assert any("quick, low" in message for *_, message in told)
+    assert told_last[:3] == ("suite", CELLS, CELLS)
+    assert any("quick, low" in message for *_, message in progress.told)
     assert "shared by 2 cells at a time" in (out / "report.md").read_text()
-    # What was finished when it was stopped is kept.
-    stored = json.loads((stopped / "cells.json").read_text())
-    assert {cell["method"] for cell in stored["cells"]} >= {"static"}
-    assert 0 < stored["about"]["missing"] < CELLS
 
 
-def refuse_in_its_words(workers: SuiteProcesses, order: Order, folder: Path) -> None:
-    """See that what a process finds wrong with an order is told in its words."""
-    methods = ("quick@object_.search.population=1",)
-    wrong = replace(order, methods=methods, recordings=order.recordings[:1], protocols=("main",))
+def refuse_in_their_words(workers: SuiteProcesses, order: Order, folder: Path) -> None:
+    """See that what a process finds wrong is told in its words, and that it works on."""
+    wrong = replace(order, methods=("quick@object_.search.population=1",))
     told = r"population is 1; expected a whole number from 2"
     with pytest.raises(UsageError, match=told):
         evaluate_suite(wrong, folder / "wrong", fill=workers.fill(wrong, folder / "wrong"))
-
-
-def test_what_a_process_finds_wrong_with_a_sequence_is_told_in_its_words(tmp_path: Path) -> None:
     making = {"object": "brick", "action": "lift", "seed": 0}
-    told = "no object named 'brick'"
-    with SuiteProcesses(1, NullProgress()) as workers, pytest.raises(UsageError, match=told):
-        workers.make({tmp_path / "brick": making})
-    assert not (tmp_path / "brick").exists()
+    with pytest.raises(UsageError, match="no object named 'brick'"):
+        workers.make({folder / "brick": making})
+    assert not (folder / "brick").exists()
 
 
 def test_whatever_is_made_of_other_cells_comes_last(recordings: tuple[Sequence, ...]) -> None:
@@ -185,34 +170,43 @@ def test_what_a_process_does_is_told_in_a_few_words() -> None:
 
 
 class Killer(Watched):
-    """Kills the process that is at work on some cells, so many times for each."""
+    """Kills the process that is at work on some cell, again and again."""
 
-    def __init__(self, times: Mapping[str, int]) -> None:
+    def __init__(self, cell: str, times: int) -> None:
         super().__init__()
+        self._cell = cell
         self._victims: set[int] = set()
-        self._left = dict(times)
+        self._times = times
 
     def report(self, *about: Any, **more: Any) -> None:
         super().report(*about, **more)
         alive = [process for process in children() if process.pid not in self._victims]
-        cell, _, _ = self.told[-1][3].partition(", low")
-        if alive and self._left.get(cell, 0):
-            self._left[cell] -= 1
+        is_busy = self.told[-1][3].startswith(self._cell) and alive
+        if is_busy and len(self._victims) < self._times:
             self._victims.add(alive[0].pid)
             alive[0].send_signal(signal.SIGKILL)
 
 
-def test_a_cell_whose_process_is_killed_is_computed_once_more_and_not_a_third_time(
-    tmp_path: Path, recordings: tuple[Sequence, ...], caplog: pytest.LogCaptureFixture
-) -> None:
-    """The next command tries it again."""
-    methods = ("static", "rigid_follow", "quick")
-    order = order_of(recordings[:1], methods=methods, protocols=("main",))
-    killer = Killer({"rigid_follow": 1, "quick": 2})
+@pytest.fixture
+def small(recordings: tuple[Sequence, ...]) -> Order:
+    return order_of(recordings[:1], methods=("static", "quick"), protocols=("main",))
+
+
+def test_a_cell_whose_process_is_killed_is_computed_once_more(tmp_path: Path, small: Order) -> None:
+    killer = Killer("quick, low", 1)
     with SuiteProcesses(1, killer) as workers:
-        found = evaluate_suite(order, tmp_path, killer, fill=workers.fill(order, tmp_path))
+        found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
     assert children() == []
-    assert (found["cells"], found["failed"], found["skipped"]) == (3, 1, [])
+    assert (found["cells"], found["failed"], found["skipped"]) == (2, 0, [])
+
+
+def test_a_cell_whose_process_is_killed_twice_is_one_failed_cell_and_tried_by_the_next_command(
+    tmp_path: Path, small: Order, caplog: pytest.LogCaptureFixture
+) -> None:
+    killer = Killer("quick, low", 2)
+    with SuiteProcesses(1, killer) as workers:
+        found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
+    assert (found["cells"], found["failed"], found["skipped"]) == (2, 1, [])
     told = r"The process that worked on it ended, 2 times (exit code -9). If memory ran out, take"
     assert f"quick, low, main: {told}" in caplog.text
     (cell,) = (c for c in json.loads((tmp_path / "cells.json").read_text())["cells"] if c["error"])
@@ -222,17 +216,14 @@ def test_a_cell_whose_process_is_killed_is_computed_once_more_and_not_a_third_ti
     key = ("future", "track_error")
     # As any method without output, it counts as the static object.
     assert scored["quick", *key]["mean"] == scored["static", *key]["mean"]
-    assert scored["rigid_follow", *key]["mean"] != scored["static", *key]["mean"]
-    found = evaluate_suite(order, tmp_path)
-    assert (found["cells"], found["failed"]) == (3, 0)
+    found = evaluate_suite(small, tmp_path)
+    assert (found["cells"], found["failed"]) == (2, 0)
     assert table(tmp_path)["quick", *key]["mean"] != scored["static", *key]["mean"]
 
 
 def test_a_lost_cell_without_which_nothing_can_be_scored_is_left_out_and_says_so(
-    tmp_path: Path, recordings: tuple[Sequence, ...]
+    tmp_path: Path, small: Order
 ) -> None:
-    small = order_of(recordings[:1], methods=("static", "quick"), protocols=("main",))
-
     def lose(tasks: object) -> Iterator[tuple[int, str]]:
         yield from ((number, "It was lost.") for number in range(2))
 
@@ -240,6 +231,18 @@ def test_a_lost_cell_without_which_nothing_can_be_scored_is_left_out_and_says_so
     assert (found["cells"], found["failed"]) == (0, 0)
     assert found["skipped"] == [f"{m}, low, main: It was lost." for m in ("static", "quick")]
     assert not list((tmp_path / "cells").glob("*")) if (tmp_path / "cells").exists() else True
+
+
+def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
+    tmp_path: Path, order: Order
+) -> None:
+    progress = Watched(stop_at="quick, low")
+    with pytest.raises(CancelledError), SuiteProcesses(2, progress) as workers:
+        evaluate_suite(order, tmp_path, progress, fill=workers.fill(order, tmp_path))
+    assert children() == []
+    stored = json.loads((tmp_path / "cells.json").read_text())
+    assert {cell["method"] for cell in stored["cells"]} >= {"static"}
+    assert 0 < stored["about"]["missing"] < CELLS
 
 
 def test_an_order_survives_being_told_to_another_process(order: Order) -> None:
