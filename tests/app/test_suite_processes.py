@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.run import Run
+from physhandi.synthetic.suite import evaluation
 from physhandi.synthetic.suite.evaluation import Order, evaluate_suite, filler, list_tasks
 from physhandi.synthetic.suite.methods import parse_method
 
@@ -170,13 +171,16 @@ def test_what_a_process_does_is_told_in_a_few_words() -> None:
 
 
 class Killer(Watched):
-    """Kills the process that is at work on some cell, again and again."""
+    """Kills the process that is at work on a cell, so often, while the cell cannot be finished."""
 
-    def __init__(self, cell: str, times: int) -> None:
+    def __init__(self, cell: str, times: int, lock: Path) -> None:
         super().__init__()
+        lock.parent.mkdir()
         self._cell = cell
         self._victims: set[int] = set()
         self._times = times
+        self._held = ExitStack()
+        self._held.enter_context(locked_file(lock))
 
     def report(self, *about: Any, **more: Any) -> None:
         super().report(*about, **more)
@@ -185,6 +189,15 @@ class Killer(Watched):
         if is_busy and len(self._victims) < self._times:
             self._victims.add(alive[0].pid)
             alive[0].send_signal(signal.SIGKILL)
+        if len(self._victims) == self._times:
+            self._held.close()
+
+
+def lock_of_quick(order: Order, out: Path) -> Path:
+    """The lock that whoever fills the cell of `quick` holds."""
+    work = evaluation._Work(evaluation._read(order)[0], out, NullProgress())
+    cell = work.bench._folder(parse_method("quick"), order.recordings[0], "recording")
+    return out / "locks" / cell.name
 
 
 @pytest.fixture
@@ -193,9 +206,11 @@ def small(recordings: tuple[Sequence, ...]) -> Order:
 
 
 def test_a_cell_whose_process_is_killed_is_computed_once_more(tmp_path: Path, small: Order) -> None:
-    killer = Killer("quick, low", 1)
+    lock = lock_of_quick(small, tmp_path)
+    killer = Killer("quick, low", 1, lock)
     with SuiteProcesses(1, killer) as workers:
         found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
+    assert (tmp_path / "cells" / lock.name).is_dir()
     assert children() == []
     assert (found["cells"], found["failed"], found["skipped"]) == (2, 0, [])
 
@@ -203,7 +218,7 @@ def test_a_cell_whose_process_is_killed_is_computed_once_more(tmp_path: Path, sm
 def test_a_cell_whose_process_is_killed_twice_is_one_failed_cell_and_tried_by_the_next_command(
     tmp_path: Path, small: Order, caplog: pytest.LogCaptureFixture
 ) -> None:
-    killer = Killer("quick, low", 2)
+    killer = Killer("quick, low", 2, lock_of_quick(small, tmp_path))
     with SuiteProcesses(1, killer) as workers:
         found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
     assert (found["cells"], found["failed"], found["skipped"]) == (2, 1, [])
