@@ -133,7 +133,8 @@ def evaluate_suite(
     def write() -> dict[str, Any]:
         missing = len(tasks) - finished
         recordings = () if missing else order.recordings
-        return folder.write(_environment(order), work.skipped, missing, recordings)
+        environment = _environment(order)
+        return folder.write(environment, work.skipped, missing, recordings, order.device)
 
     try:
         here = ((number, "") for number in range(len(tasks)))

@@ -104,6 +104,7 @@ class SuiteFolder:
         skipped: Many[str],
         missing: int,
         recordings: Many[Sequence] = (),
+        device: str = "cpu",
     ) -> dict[str, Any]:
         """Write cells, tables, report, charts and pictures of the finished cells.
 
@@ -112,6 +113,7 @@ class SuiteFolder:
             skipped: Reasons for skipped cells.
             missing: Number of unfinished cells of the order.
             recordings: Sequences of which pictures are drawn.
+            device: Warp device that draws them.
 
         Returns:
             ``out``, ``table`` and ``report``: paths.
@@ -132,7 +134,8 @@ class SuiteFolder:
         against = "phystwin" if "phystwin" in methods else (methods or [""])[0]
         differences = compare(scores, against)
         above = compare(scores, FLOOR) if against != FLOOR else []
-        about["pictures"] = list(write_motion_pictures(self.out / "charts", recordings, cells))
+        pictures = write_motion_pictures(self.out / "charts", recordings, cells, device)
+        about["pictures"] = list(pictures)
         files = write_report(about, rows, differences, above, cells)
         about["charts"] = [Path(file).name for file in files if file.startswith("charts/")]
         about["charts"] += about["pictures"]

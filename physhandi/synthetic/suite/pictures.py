@@ -36,7 +36,7 @@ _HAND_POINT = 0.003
 
 
 def motion_picture(
-    recording: Sequence, runs: Mapping[str, RunFolder]
+    recording: Sequence, runs: Mapping[str, RunFolder], device: str = "cpu"
 ) -> UInt8[ndarray, "row column 3"]:
     """Draw the true motion in the first row, and below it the nodes of each run.
 
@@ -46,6 +46,7 @@ def motion_picture(
     Args:
         recording: The whole recording, with its truth and a view.
         runs: What was made of it, by the name that stands beside the row.
+        device: Warp device that draws it.
 
     Returns:
         Red, green and blue.
@@ -88,7 +89,7 @@ def motion_picture(
             )
             shapes.append([nodes, *_hands(vertex, face, frame)])
         rows.append((name, shapes))
-    drawn = [_row(camera, name, shapes) for name, shapes in rows]
+    drawn = [_row(camera, name, shapes, device) for name, shapes in rows]
     return np.concatenate([_heading(recording, frames), *drawn, _scale(len(frames))])
 
 
@@ -100,7 +101,10 @@ def moments(recording: Sequence) -> list[int]:
 
 
 def write_motion_pictures(
-    folder: Path, recordings: Many[Sequence], cells: Many[Mapping[str, object]]
+    folder: Path,
+    recordings: Many[Sequence],
+    cells: Many[Mapping[str, object]],
+    device: str = "cpu",
 ) -> Iterator[str]:
     """Write a picture of every sequence of a suite, and give the name of each file.
 
@@ -108,6 +112,7 @@ def write_motion_pictures(
         folder: Where pictures go.
         recordings: The whole recordings; those without a true surface or a view are left out.
         cells: The suite's finished cells.
+        device: Warp device that draws them.
     """
     for recording in recordings:
         runs = {
@@ -119,7 +124,7 @@ def write_motion_pictures(
             and _is_drawn(str(cell["method"]))
         }
         try:
-            picture = motion_picture(recording, runs)
+            picture = motion_picture(recording, runs, device)
         except MissingInputError:
             continue
         name = f"motion_{recording.name}.png"
@@ -153,9 +158,12 @@ def _hands(vertex: Mapping[Side, ndarray], face: Mapping[Side, ndarray], frame: 
 
 
 def _row(
-    camera: PinholeCamera, name: str, shapes: list[list[Shape]]
+    camera: PinholeCamera, name: str, shapes: list[list[Shape]], device: str
 ) -> UInt8[ndarray, "row column 3"]:
-    images = [render(camera, of_frame, background=_BACKGROUND)[..., :3] for of_frame in shapes]
+    images = [
+        render(camera, of_frame, background=_BACKGROUND, device=device)[..., :3]
+        for of_frame in shapes
+    ]
     row = np.ascontiguousarray(np.concatenate(images, axis=1))
     _write(row, name, (6, 16))
     return row

@@ -87,7 +87,7 @@ def test_moments_are_the_start_the_last_fitted_frame_and_predicted_ones(
 
 
 def test_nodes_have_the_color_of_their_distance_from_the_true_motion(
-    recording: Sequence, tmp_path: Path
+    recording: Sequence, tmp_path: Path, device: str
 ) -> None:
     marker = np.asarray(recording.marker)
     late = marker.copy()
@@ -96,7 +96,7 @@ def test_nodes_have_the_color_of_their_distance_from_the_true_motion(
         "exact": run_of(tmp_path / "exact", recording, marker),
         "late": run_of(tmp_path / "late", recording, late),
     }
-    picture = motion_picture(recording, runs)
+    picture = motion_picture(recording, runs, device)
     assert picture.shape == (2 * LABEL + 3 * HEIGHT, 4 * WIDTH, 3)
     for column in range(4):
         surface = cell(picture, 0, column)
