@@ -371,8 +371,7 @@ def run_child(work: Callable[[Channel], None]) -> NoReturn:
 
     The process ends with its parent, unless that was started to outlive it.
     """
-    # A process that ends has no use for a search among all that torch and Warp have loaded.
-    atexit.register(gc.freeze)
+    end_without_collecting()
     parent = os.environ.pop(_PARENT, "")
     if parent:
         die_with_parent(int(parent))
@@ -394,6 +393,11 @@ def run_child(work: Callable[[Channel], None]) -> NoReturn:
         channel.tell(error=defect, kind=type(error).__name__)
         sys.exit(1)
     sys.exit(0)
+
+
+def end_without_collecting() -> None:
+    """Have this process end without a search for garbage among all that torch and Warp loaded."""
+    atexit.register(gc.freeze)
 
 
 def die_with_parent(parent: int) -> None:

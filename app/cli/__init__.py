@@ -1,7 +1,5 @@
 """The `physhandi` command: functions become subcommands, and every failure is one clear line."""
 
-import atexit
-import gc
 import logging
 import sys
 
@@ -10,6 +8,7 @@ from tyro.extras import SubcommandApp
 
 from app.cli import benchmark, data_folder, recordings, runs, serving
 from app.cli.suite import evaluate_suite
+from physhandi.child import end_without_collecting
 from physhandi.errors import PhysHandiError, UsageError, describe
 
 
@@ -63,8 +62,7 @@ def build() -> SubcommandApp:
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 failed with one clear line, 2 bad usage."""
-    # A command that ends has no use for a search among all that it has loaded.
-    atexit.register(gc.freeze)
+    end_without_collecting()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
         code = build().cli(prog="physhandi", args=argv, config=(tyro.conf.OmitArgPrefixes,)) or 0

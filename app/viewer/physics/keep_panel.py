@@ -108,24 +108,16 @@ class RunSaver:
         source = self._catalog.run(source_id)
         recordings = self._catalog.sequences_of(source)
         recording = recordings[source.sequence_names.index(sequence)]
-
-        def make() -> Run:
-            run = Run.create(
-                self._folder / new_run_id(),
-                name=name,
-                kind="simulation",
-                sequences=[str(recording.folder)],
-                config={
-                    "source": str(source.folder.resolve()),
-                    **({} if edits is None else {"edits": describe_edits(edits)}),
-                    "parameters": dict(changes),
-                },
-            )
-            if edits is not None:
-                store_edits(run.folder, edits)
-            return run
-
-        return self._start(make)
+        parameters = {"parameters": dict(changes)}
+        if edits is None:
+            return self._simulate(source, recording.folder, name, parameters)
+        return self._simulate(
+            source,
+            recording.folder,
+            name,
+            {"edits": describe_edits(edits)} | parameters,
+            lambda folder: store_edits(folder, edits),
+        )
 
     def save_take(
         self, source_id: str, stored: StoredTake, name: str, changes: Mapping[str, Any]
@@ -153,20 +145,37 @@ class RunSaver:
         source = self._catalog.run(source_id)
         if keeps_springs(source):  # What is steered of such an object is an edited one, too.
             stored = replace(stored, take=replace(stored.take, is_edited=True))
+        config = {"parameters": dict(changes), "take": stored.to_dict()}
+        return self._simulate(source, folder, name, config, stored.save)
+
+    def _simulate(
+        self,
+        source: Run,
+        recording: Path,
+        name: str,
+        config: Mapping[str, Any],
+        store: Callable[[Path], None] | None = None,
+    ) -> Run:
+        """Make a run of a source's object and have it worked on.
+
+        Args:
+            source: The run whose object is simulated.
+            recording: Folder of the recording that it is measured by.
+            name: What the user calls the new run.
+            config: What its configuration says beside the source.
+            store: Writes into its folder what the configuration describes; None for nothing.
+        """
 
         def make() -> Run:
             run = Run.create(
                 self._folder / new_run_id(),
                 name=name,
                 kind="simulation",
-                sequences=[str(folder)],
-                config={
-                    "source": str(source.folder.resolve()),
-                    "parameters": dict(changes),
-                    "take": stored.to_dict(),
-                },
+                sequences=[str(recording)],
+                config={"source": str(source.folder.resolve()), **config},
             )
-            stored.save(run.folder)
+            if store is not None:
+                store(run.folder)
             return run
 
         return self._start(make)

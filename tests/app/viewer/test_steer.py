@@ -304,8 +304,8 @@ def test_the_fingers_of_a_hand_close_while_a_key_is_held(towel: Session) -> None
         start = steer(client)
         object_ = session._steer._object
         wait(client, lambda: object_.newest.pull is not None)
-        before = client.array(HAND, "vertices")
-        np.testing.assert_allclose(before, session._content.hands[0].vertex[AT], atol=1e-6)
+        before = session._content.hands[0].vertex[AT]
+        wait(client, lambda: np.allclose(client.array(HAND, "vertices"), before, atol=1e-6))
         hold(session, "KeyR")
         wait(client, lambda: object_.newest.pose[0, 6] == 1.0)
         hold(session)
