@@ -25,6 +25,8 @@ PURPLE = (0.8, 0.0, 0.8)
 """A color that nothing of the scene has."""
 TEAL = (50, 136, 152)
 """The towel's color in frame 0 of the recording."""
+BELOW = (0, 80, 94)
+"""The same as its underside is seen, which faces no lamp."""
 
 
 def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
@@ -179,9 +181,9 @@ def purple(scene: ScenePage) -> int:
     return int(((red > 110) & (blue > 110) & (green < 70)).sum())
 
 
-def recorded(scene: ScenePage) -> int:
-    """Count the pixels that have the color which the recording shows of the towel."""
-    return int((np.abs(shot_of(scene) - TEAL) < 20).all(axis=-1).sum())
+def seen_as(scene: ScenePage, color: tuple[int, int, int]) -> int:
+    """Count the pixels that have about a color."""
+    return int((np.abs(shot_of(scene) - color) < 20).all(axis=-1).sum())
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +220,7 @@ def test_a_scene_opens_on_the_surface_and_a_key_shows_splats(context, own_server
     scene.until(lambda: scene.has("object springs"), "the panel appears")
     scene.pause()
     scene.go(0)
-    scene.until(lambda: recorded(scene) > 5_000, "the surface has the color of the recording")
+    scene.until(lambda: seen_as(scene, TEAL) > 5_000, "the surface has the recording's color")
     expect(home.locator("[data-first-hint]")).to_contain_text("0 shows splats")
     home.locator(".hints").click()
     press_and_see(scene, "0", "show")
@@ -226,3 +228,9 @@ def test_a_scene_opens_on_the_surface_and_a_key_shows_splats(context, own_server
     for form in ("nodes", "surface"):
         press_and_see(scene, "0", "show")
         scene.until(lambda: purple(scene) < 50, f"the {form} has its own color")
+    assert seen_as(scene, BELOW) < 500
+    home.mouse.move(400, 300)
+    home.mouse.down()
+    home.mouse.move(400, -100, steps=4)
+    home.mouse.up()
+    scene.until(lambda: seen_as(scene, BELOW) > 5_000, "the underside is darker, and not black")

@@ -17,6 +17,9 @@ _SURROUNDINGS = "city"
 _BRIGHTNESS = 0.4
 """Of that light. With it and the lamps that `web_assets/scene_frame.js` turns down, a towel that
 was recorded as (50, 136, 152) is seen as (43, 136, 160); with all of it as (117, 186, 205)."""
+_FROM_BELOW = 0.9
+"""How brightly what faces down is lit. The surroundings are nearly black there: of the same towel's
+underside (1, 23, 29) was seen, and (0, 80, 94) is with this."""
 
 
 def start_viser(label: str) -> viser.ViserServer:
@@ -31,6 +34,10 @@ def start_viser(label: str) -> viser.ViserServer:
     infrastructure: Any = server._websock_server  # noqa: SLF001  # no other way
     infrastructure.unregister_handler(messages.ShareUrlRequest)
     server.scene.configure_environment_map(_SURROUNDINGS, environment_intensity=_BRIGHTNESS)
+    # Black from above: what faces up stays as it is. At its origin a lamp of this kind knows no up.
+    server.scene.add_light_hemisphere(
+        "/light_from_below", sky_color=(0, 0, 0), intensity=_FROM_BELOW, position=(0.0, 0.0, 1.0)
+    )
     return server
 
 
