@@ -24,6 +24,8 @@ _COMMIT_DIGITS = 12
 _SPLITS = {"reconstruction": "fitted frames", "future": "predicted frames"}
 _UNCOMPARED = {"description", "aggregation", "unit", "frames"}
 
+_TOLD_ELSEWHERE = {"profile", "edits", "overrides"}
+"""What a configuration has of its own beside settings; those that override a profile are in it."""
 _CHANGED = "parameters."
 """Settings that begin so are the parameters that a simulation was asked to change."""
 _NOTICED = 0.005
@@ -250,7 +252,7 @@ def _losses_of(result: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 def _settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Flatten a configuration; the settings of a profile are named without saying so."""
     profile = named_fields(config.get("profile")) or {}
-    others = {key: value for key, value in config.items() if key not in {"profile", "edits"}}
+    others = {key: value for key, value in config.items() if key not in _TOLD_ELSEWHERE}
     flat = flatten(profile) | flatten(others)
     return {name: value for name, value in flat.items() if name not in _UNCOMPARED}
 

@@ -6,7 +6,7 @@ by paths such as ``object_.search.generations`` and are listed by `all_settings`
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -600,7 +600,7 @@ class Setting:
     name: str
     """Its own name."""
     title: str
-    """Its name in words, with where it belongs if others have the same name."""
+    """Its path in words, such as ``appearance / enabled``; of an interval, what is searched."""
     about: str
     """What it means, in a sentence."""
     unit: str
@@ -622,11 +622,6 @@ class Setting:
 def all_settings() -> tuple[Setting, ...]:
     """List all settings, those that belong together in a row."""
     settings = [_setting(path, entry) for path, entry in _plain_fields().items()]
-    names = [setting.name for setting in settings]
-    settings = [
-        replace(setting, title=_title(setting, is_shared=names.count(setting.name) > 1))
-        for setting in settings
-    ]
     intervals = [_interval(PARAMETERS[name]) for name in SEARCHABLE]
     order = list(GROUPS)
     return tuple(sorted([*settings, *intervals], key=lambda setting: order.index(setting.group)))
@@ -653,7 +648,7 @@ def _setting(path: str, entry: Field) -> Setting:
         path=path,
         group=path.rpartition(".")[0],
         name=entry.name,
-        title="",
+        title=" / ".join(part.strip("_").replace("_", " ") for part in path.split(".")),
         about=entry.about,
         unit=entry.unit,
         kind=entry.kind,
@@ -662,11 +657,6 @@ def _setting(path: str, entry: Field) -> Setting:
         choices=entry.choices,
         is_optional=entry.is_optional,
     )
-
-
-def _title(setting: Setting, *, is_shared: bool) -> str:
-    owner = f"{setting.group.rpartition('.')[2].strip('_')} " if is_shared else ""
-    return f"{owner}{setting.name}".replace("_", " ")
 
 
 def _interval(parameter: Field) -> Setting:

@@ -52,7 +52,14 @@ def test_only_what_differs_is_kept_as_changes_and_all_settings_are_stored(
     assert rows["object_.search.generations"] == ("6", "12")
     assert rows["object_.search.variables.friction"] == ("not searched", "0 to 1")
     assert rows["object_.search.variables.drag"] == ("0 to 10", "not searched")
+    titles = {row["path"]: row["title"] for row in shown["changes"]}
+    assert titles["object_.search.generations"] == "object / search / generations"
     page = world.client.get(f"/runs/{run_id}").text
+    assert "object / search / generations <span" in page
+    as_quick = order(world).json()["id"]
+    diff = world.client.get("/diff", params={"run": [as_quick, run_id], "show": "all"}).text
+    assert diff.count("object / search / generations<") == 1
+    assert "overrides" not in diff
     assert 'Made from <a href="runs/fitted">a sheet</a>' in page
     assert "4 settings differ from profile quick" in page
     assert world.client.delete("/api/v1/runs/fitted").status_code == 204
