@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from physhandi.simulation.forces import spring_strains
@@ -28,7 +28,7 @@ FIRM_HOLD = 4
 """Virtual springs that fix the place of a node, whatever hangs on it."""
 COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
-
+_CHOICES = ("moves_hands", "eases_grips")
 
 NodeState = tuple[Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]
 """Positions [m] and velocities [m/s] of the object nodes."""
@@ -75,6 +75,10 @@ class Restart:
     moves_hands: bool = False
     """Whether control nodes go on beside themselves, moved as what they hold is (`hand_shift`), so
     that virtual springs keep their directions and not only their strain: a grip is what it was."""
+    eases_grips: bool = False
+    """Whether virtual springs of nodes that lie on the ground start without strain. What they were
+    stretched by stands for what the hand slipped over the object by, which does not come back when
+    the hand turns, and the ground's friction holds these nodes without them."""
 
     def __post_init__(self) -> None:
         if self.frame < 0:
@@ -102,10 +106,10 @@ class Restart:
     ) -> SpringMassModel:
         """Give the model with which the frames after the restart are simulated.
 
-        A spring keeps its strain, unless its rest length would fall below its floor or below
-        `SHORTEST_SHARE` of what it was. One whose ends coincide in the rollout has no strain to
-        keep: its rest length stays. A node that lies on the ground in the rollout has its height in
-        the new state as its clearance from then on.
+        A spring keeps its strain, or has none where grips are eased, unless its rest length would
+        fall below its floor or below `SHORTEST_SHARE` of what it was. One whose ends coincide in
+        the rollout has no strain to keep: its rest length stays. A node that lies on the ground in
+        the rollout has its height in the new state as its clearance from then on.
 
         Args:
             model: The springs until then; virtual ones are changed as the object's own.
@@ -122,9 +126,19 @@ class Restart:
         floor = np.full_like(rest, parameters.virtual_rest_length_floor)
         floor[: model.object_spring_count] = parameters.rest_length_floor
         shortest = np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
-        scaled = np.maximum(scale * rest, shortest)
-        clearance = self._clearance(model, parameters.ground_height, position)
-        return replace(model, rest_length=scaled.astype(np.float32), clearance=clearance)
+        rests = _rests_on(model, parameters.ground_height, position)
+        scaled = scale * rest
+        if self.eases_grips:
+            held = model.spring_nodes[model.object_spring_count :].min(axis=1)
+            is_eased = np.zeros(len(rest), bool)
+            is_eased[model.object_spring_count :] = rests[held]
+            scaled = np.where(is_eased, after, scaled)
+        scaled = np.maximum(scaled, shortest).astype(np.float32)
+        clearance = model.clearance
+        if parameters.ground_height is not None:
+            height = np.maximum(self.position[:, 2] - parameters.ground_height, 0.0)
+            clearance = np.where(rests, height, clearance).astype(np.float32)
+        return replace(model, rest_length=scaled, clearance=clearance)
 
     def hand_shift(
         self, model: SpringMassModel, position: Float[ndarray, "node 3"]
@@ -152,40 +166,41 @@ class Restart:
         count = np.maximum(np.bincount(control, minlength=model.control_count), 1)
         return (np.stack(total, axis=1) / count[:, None]).astype(np.float32)
 
-    def _clearance(
-        self,
-        model: SpringMassModel,
-        ground_height: float | None,
-        position: Float[ndarray, "node 3"],
-    ) -> Float32[ndarray, " node"]:
-        """Let nodes that lie on the ground lie on it where they are now [m]."""
-        if ground_height is None:
-            return model.clearance
-        touches = position[:, 2] - ground_height - model.clearance < TOUCHING
-        height = np.maximum(self.position[:, 2] - ground_height, 0.0)
-        return np.where(touches, height, model.clearance).astype(np.float32)
-
     def to_tensors(self) -> dict[str, ndarray]:
         """Return every field as an array, ready for safetensors."""
         frame = np.array([self.frame], dtype=np.int32)
         state = {"frame": frame, "position": self.position, "velocity": self.velocity}
-        return state | {"moves_hands": np.array([self.moves_hands], dtype=np.int32)}
+        return state | {
+            name: np.array([getattr(self, name)], dtype=np.int32) for name in _CHOICES
+        }
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Restart":
-        """Rebuild it from the arrays of `to_tensors`; hands were not moved before it was said.
+        """Rebuild it from the arrays of `to_tensors`; what it does not say was not done.
 
         Raises:
             ValueError: If an array is missing, unknown or inconsistent.
         """
-        if set(tensors) | {"moves_hands"} != {"frame", "position", "velocity", "moves_hands"}:
+        needed = {"frame", "position", "velocity"}
+        if not needed <= set(tensors) <= needed | set(_CHOICES):
             raise ValueError(
-                "A restart needs the arrays frame, position, velocity, moves_hands; "
-                f"got {', '.join(sorted(tensors))}."
+                "A restart needs the arrays frame, position and velocity, and may have "
+                f"{' and '.join(_CHOICES)}; got {', '.join(sorted(tensors))}."
             )
         frame = np.asarray(tensors["frame"]).reshape(-1)
         if len(frame) != 1:
             raise ValueError(f"frame has {len(frame)} values; expected one.")
         state = {name: np.asarray(tensors[name], np.float32) for name in ("position", "velocity")}
-        moves = bool(np.asarray(tensors.get("moves_hands", [0])).reshape(-1)[0])
-        return cls(frame=int(frame[0]), moves_hands=moves, **state)
+        choices = {
+            name: bool(np.asarray(tensors.get(name, [0])).reshape(-1)[0]) for name in _CHOICES
+        }
+        return cls(frame=int(frame[0]), **state, **choices)
+
+
+def _rests_on(
+    model: SpringMassModel, ground_height: float | None, position: Float[ndarray, "node 3"]
+) -> Bool[ndarray, " node"]:
+    """Say which nodes lie on the ground."""
+    if ground_height is None:
+        return np.zeros(model.node_count, bool)
+    return position[:, 2] - ground_height - model.clearance < TOUCHING

@@ -66,6 +66,7 @@ def observed_state(
         position=position.astype(np.float32),
         velocity=velocity.astype(np.float32),
         moves_hands=moves_hands,
+        eases_grips=True,
     )
 
 

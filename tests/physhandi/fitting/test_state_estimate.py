@@ -89,8 +89,9 @@ def test_the_velocity_is_the_rollouts_if_the_frame_before_shows_no_track() -> No
     np.testing.assert_allclose(found.velocity, simulate(SCENE)[1][LAST], atol=5e-6)
 
 
-def test_no_node_ends_below_the_ground() -> None:
+def test_no_node_ends_below_the_ground_and_grips_are_eased_there() -> None:
     found = estimate(observed(np.full((8, 3), -1.0)))
+    assert found.eases_grips
     assert found.position[:, 2].tolist() == [0.0] * 8
     assert found.position[:, 0].max() < -0.5
     model, parameters = as_model(SCENE)

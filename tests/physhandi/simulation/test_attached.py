@@ -279,15 +279,23 @@ def test_late_springs_count_for_stability_in_every_direction() -> None:
     assert known > 1.001 * safe
 
 
-@pytest.mark.parametrize("distance", [None, 0.002], ids=["engine", "self_collision"])
-def test_hands_go_on_beside_themselves_after_a_restart(device: str, distance: float | None) -> None:
+@pytest.mark.parametrize(
+    ("distance", "eases"),
+    [(None, False), (0.002, False), (None, True)],
+    ids=["engine", "self_collision", "eased"],
+)
+def test_hands_go_on_beside_themselves_after_a_restart(
+    device: str, distance: float | None, eases: bool
+) -> None:
     scene, at = held_in_turns(distance=distance), 2
     own = simulate(scene)[0][at]
     rng = np.random.default_rng(5)
     shift = rng.normal(0, 0.003, own.shape) + np.array([0.0, 0.0, 0.006])
     node = np.float32(own + shift)
     velocity = np.float32(rng.normal(0, 0.1, own.shape))
-    restart = Restart(frame=at, position=node, velocity=velocity, moves_hands=True)
+    restart = Restart(
+        frame=at, position=node, velocity=velocity, moves_hands=True, eases_grips=eases
+    )
     found = Simulator(*as_model(scene), device=device).rollout(scene.control, restart).position
     # Springs (9, 5), (6, 10) and (7, 11) act in frame 2, (5, 8) and (4, 8) do not.
     moved = np.stack([np.zeros(3), *(node - own)[[5, 6, 7]]])
@@ -299,11 +307,17 @@ def test_hands_go_on_beside_themselves_after_a_restart(device: str, distance: fl
             np.vstack([node, scene.control[at] + moved]),
         )
     ]
+    rest = scene.rest * length[1] / length[0]
+    # Of the held nodes 6 lies on the ground, 5 and 7 hang; (4, 8) holds one on the ground later.
+    on_ground = [[4, 8], [6, 10]]
+    is_eased = np.array([eases and sorted(pair) in on_ground for pair in scene.springs.tolist()])
+    assert is_eased.sum() == 2 * eases
+    kept, rest = rest, np.where(is_eased, length[1], rest)
     later = replace(
         scene,
         node=node.astype(float),
         velocity=velocity.astype(float),
-        rest=scene.rest * length[1] / length[0],
+        rest=rest,
         control=scene.control[at:] + moved,
         attached=scene.attached - at,
         clearance=np.where(own[:, 2] < 0.003, np.maximum(node[:, 2], 0.0), 0.0),
@@ -312,10 +326,16 @@ def test_hands_go_on_beside_themselves_after_a_restart(device: str, distance: fl
     np.testing.assert_allclose(found[at + 1 :], simulate(later)[0][1:], atol=1e-6)
     still = simulate(replace(later, control=scene.control[at:]))[0]
     assert np.abs(found[at + 1 :] - still[1:]).max() > 1e-4
-    stored = Restart.from_tensors(restart.to_tensors())
-    assert stored.moves_hands
-    old = {name: value for name, value in restart.to_tensors().items() if name != "moves_hands"}
-    assert not Restart.from_tensors(old).moves_hands
+    if eases:
+        tense = simulate(replace(later, rest=kept))[0]
+        assert np.abs(found[at + 1 :] - tense[1:]).max() > 1e-4
+    tensors = restart.to_tensors()
+    stored = Restart.from_tensors(tensors)
+    assert (stored.moves_hands, stored.eases_grips) == (True, eases)
+    # What older runs stored goes on as they did.
+    for name in ("eases_grips", "moves_hands"):
+        del tensors[name]
+        assert not getattr(Restart.from_tensors(tensors), name)
 
 
 def test_a_node_that_four_springs_hold_moves_no_hand() -> None:
