@@ -170,9 +170,7 @@ class Restart:
         """Return every field as an array, ready for safetensors."""
         frame = np.array([self.frame], dtype=np.int32)
         state = {"frame": frame, "position": self.position, "velocity": self.velocity}
-        return state | {
-            name: np.array([getattr(self, name)], dtype=np.int32) for name in _CHOICES
-        }
+        return state | {name: np.array([getattr(self, name)], dtype=np.int32) for name in _CHOICES}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Restart":
