@@ -188,11 +188,16 @@ class Restart:
         frame = np.asarray(tensors["frame"]).reshape(-1)
         if len(frame) != 1:
             raise ValueError(f"frame has {len(frame)} values; expected one.")
-        state = {name: np.asarray(tensors[name], np.float32) for name in ("position", "velocity")}
-        choices = {
-            name: bool(np.asarray(tensors.get(name, [0])).reshape(-1)[0]) for name in _CHOICES
-        }
-        return cls(frame=int(frame[0]), **state, **choices)
+        moves, eases = (
+            bool(np.asarray(tensors.get(name, [0])).reshape(-1)[0]) for name in _CHOICES
+        )
+        return cls(
+            frame=int(frame[0]),
+            position=np.asarray(tensors["position"], np.float32),
+            velocity=np.asarray(tensors["velocity"], np.float32),
+            moves_hands=moves,
+            eases_grips=eases,
+        )
 
 
 def _rests_on(
