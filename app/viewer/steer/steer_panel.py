@@ -513,6 +513,11 @@ class SteerPanel:
         """Whether a hand is a point of the object that is held by itself."""
         return hand >= max(len(self._content.hands), 1) and hand < len(take.hands)
 
+    def _what(self, take: Take, hand: int) -> str:
+        """Say within a sentence what is moved."""
+        title = _title(take.hands[hand])
+        return title if self._is_point(take, hand) else f"the {title}"
+
     def _offer(self, take: Take) -> None:
         """Let the hands of a take be chosen, if they are others than before."""
         if self._take is take:
@@ -720,11 +725,8 @@ class SteerPanel:
         state: dict[str, Any] = {"steering": self.is_on}
         if self.is_on and self._take is not None:
             number, finger = self._moved.hand, self._moved.finger
-            name = self._take.hands[number].name
-            hand = " hand" if self._content.hands else ""
-            is_point = self._is_point(self._take, number)
-            state["what"] = name if is_point else f"the {name}{hand}"
-            state["turns"] = not is_point
+            state["what"] = self._what(self._take, number)
+            state["turns"] = not self._is_point(self._take, number)
             state["curls"] = self._take.hands[number].curls is not None
             state["finger"] = "" if finger is None else FINGERS[finger]
             state["recording"] = self._object is not None and self._object.is_recording
@@ -760,7 +762,7 @@ class SteerPanel:
         if frame.pull is None or hand >= len(frame.pull):
             return ""
         force = self._newtons() * float(np.linalg.norm(frame.pull[hand]))
-        return f"<br>the object pulls with {force:.2g} N"
+        return f"<br>the object pulls at {self._what(frame.take, hand)} with {force:.2g} N"
 
     def _show_buttons(self, steered: SteeredObject | None) -> None:
         """Say on the buttons what they would do now; those that do nothing are hidden."""
@@ -862,11 +864,16 @@ def _choices(take: Take) -> dict[str, Moved]:
     """Name all that can be moved."""
     names: dict[str, Moved] = {}
     for number, hand in enumerate(take.hands):
-        names[hand.name] = Moved(number)
+        names[_title(hand)] = Moved(number)
         if hand.fingers is not None:
             for finger, name in enumerate(FINGERS):
                 names[f"{hand.name} {name}"] = Moved(number, finger)
     return names
+
+
+def _title(hand: SteeredHand) -> str:
+    """Name what is moved for people."""
+    return f"{hand.name} hand" if hand.name in {"right", "left"} else hand.name
 
 
 def _dot_width(take: Take) -> float:

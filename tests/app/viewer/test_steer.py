@@ -1,6 +1,7 @@
 """Steering in a live scene: the mode, held keys, the gizmo, and the way back to playback."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -388,7 +389,7 @@ def test_a_fingertip_goes_as_far_as_it_can_and_its_gizmo_comes_back_to_it(index)
     notices = len(client.messages)
     drag(client, np.full(3, np.nan))
     wait(client, lambda: any("finite" in str(m) for m in client.messages[notices:]))
-    client.set("Move", "right")
+    client.set("Move", "right hand")
     wait(client, lambda: np.allclose(client.positions[GIZMO], joint[0], atol=1e-6))
 
 
@@ -425,3 +426,86 @@ def test_the_clock_and_a_user_who_leaves_end_it(scene) -> None:
     steer(client)
     client.connection.close()
     until(lambda: not session._steer.is_on)
+
+
+@pytest.fixture
+def two_hands(tmp_path: Path) -> Iterator[Session]:
+    """The bundled towel with a left hand beyond it, the mirror image of the right one."""
+    held = Run.open(BUNDLED / "runs" / "towel_fold_quick")
+    recording = [str(BUNDLED / "towel_fold")]
+    run = Run.create(
+        tmp_path / "runs" / "two", name="Two", kind="reconstruction", sequences=recording, config={}
+    )
+    folder = "sequences/towel_fold"
+    mirror = np.array([-1, 1, 1], np.float32)
+    with run.begin_attempt() as attempt:
+        shutil.copytree(held.out, attempt.out, dirs_exist_ok=True)
+        for name in ("vertex", "keypoint"):
+            place = held.array(f"{folder}/hand_right_{name}.npy")
+            attempt.save_array(f"{folder}/hand_left_{name}.npy", place * mirror)
+        face = held.array(f"{folder}/hand_right_face.npy")
+        attempt.save_array(f"{folder}/hand_left_face.npy", face[:, ::-1])
+        skin = held.tensors(f"{folder}/hand_right_skin.safetensors")
+        flip = np.diag([*mirror, 1]).astype(np.float32)
+        mirrored = {
+            "T_bone_hand": flip @ skin["T_bone_hand"] @ flip,
+            "vertex": skin["vertex"] * mirror,
+            "faces": skin["faces"][:, ::-1].copy(),
+            "translation": skin["translation"] * mirror,
+            "rotation": skin["rotation"] * np.array([1, -1, -1, 1], np.float32),
+        }
+        attempt.save_tensors(f"{folder}/hand_left_skin.safetensors", skin | mirrored)
+        control = held.array(f"{folder}/control.npy")
+        both = np.concatenate([control, control * mirror], axis=1)
+        attempt.save_array(f"{folder}/control.npy", both)
+        model = held.tensors(f"{folder}/model.safetensors")
+        model["control_count"] = 2 * model["control_count"]
+        attempt.save_tensors(f"{folder}/model.safetensors", model)
+        attempt.publish()
+    sessions = Sessions(FakeSettings(), FolderCatalog(tmp_path))
+    yield sessions.get(sessions.open("run", "two", "me"))
+    sessions.shutdown()
+
+
+def test_a_finger_of_the_other_hand_is_chosen_by_its_dot_and_moves_alone(
+    two_hands: Session,
+) -> None:
+    session = two_hands
+    right, left = session._content.hands
+    assert left.joint is not None
+    joint = left.joint[AT].astype(float)
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        rest_at(client, AT)
+        wait(client, lambda: session._playback.frame == AT and "/hand/left" in client.nodes)
+        steer(client)
+        object_ = session._steer._object
+        wait(client, lambda: object_.newest.pull is not None and DOTS in client.nodes)
+        wait(client, lambda: len(client.array(DOTS, "batched_positions")) == 11)
+        wait(client, lambda: "pulls at the right hand" in session._steer._status.content)
+        dots = client.array(DOTS, "batched_positions")
+        dot = dots[np.argmin(np.linalg.norm(dots - joint[8], axis=1))]
+        wait(client, lambda: session._inspector._grab is not None)
+        session._inspector._click(looking_down_at(dot), prefers_hand=False)
+        wait(client, lambda: client.value("Move") == "left index finger")
+        wait(client, lambda: np.allclose(client.positions[GIZMO], joint[8], atol=1e-6))
+        wait(client, lambda: "pulls at the left hand" in session._steer._status.content)
+        target = joint[8] + [-0.005, 0.0, 0.03]
+        drag(client, target)
+
+        def tip() -> np.ndarray:
+            return object_.take.hands[1].tip(1, object_.newest.pose[1])
+
+        wait(client, lambda: np.allclose(tip(), target, atol=2e-6))
+        moved = object_.newest.pose[1]
+        np.testing.assert_array_equal(object_.newest.pose[0], 0.0)
+        np.testing.assert_array_equal(moved[:11], 0.0)  # Wrist, curl and thumb.
+        assert np.abs(moved[11:15]).max() > 0.1
+        client.set("Move", "left hand")
+        wait(client, lambda: np.allclose(client.positions[GIZMO], joint[0], atol=1e-6))
+        hold(session, "KeyR")
+        wait(client, lambda: object_.newest.pose[1, 6] == 1.0)
+        hold(session)
+        np.testing.assert_array_equal(object_.newest.pose[0], 0.0)
+        wait(
+            client, lambda: np.allclose(client.array(HAND, "vertices"), right.vertex[AT], atol=1e-5)
+        )
