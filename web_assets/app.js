@@ -165,7 +165,7 @@ function showReadiness(place, answer, sequences) {
   place.hidden = !stages.length;
   const skipped = stages.filter(([, stage]) => !stage.ready);
   const summary = place.querySelector("[data-summary]");
-  const link = (id) => Object.assign(document.createElement("a"), { href: `sequences/${id}/check`, textContent: sequences.length > 1 ? `check ${id}` : "check the recording" });
+  const link = (id) => Object.assign(document.createElement("a"), { href: `sequences/${id}/check`, textContent: sequences.length > 1 ? `Check ${id}` : "Check the recording" });
   summary.className = answer?.nothing_to_fit ? "problem" : answer?.skips_object ? "doubt" : "dim";
   summary.textContent = answer?.nothing_to_fit ?? answer?.skips_object ?? (skipped.length ? "These stages have nothing to do; the others will run:" : "All stages will run.");
   for (const id of sequences) summary.append(" ", link(id));

@@ -268,6 +268,10 @@ def test_a_run_page_exports_the_rollout(home, fitted, tmp_path, picture):
     for frame in (0, 31, 59):
         nodes = ply_vertices(frames[frame])[: fitted.rollout.shape[1]]
         np.testing.assert_allclose(nodes, fitted.rollout[frame], atol=1e-6)
+    home.set_viewport_size({"width": 390, "height": 844})
+    expect(home.locator("#metrics-heading")).to_be_visible()
+    # Tables of scores that are wider than a phone scroll by themselves.
+    assert home.evaluate("document.documentElement.scrollWidth") == 390
 
 
 def test_a_fit_is_launched_followed_and_cancelled(home, served):
