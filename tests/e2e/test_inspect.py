@@ -234,3 +234,8 @@ def test_a_scene_opens_on_the_surface_and_a_key_shows_splats(context, own_server
     home.mouse.move(400, -100, steps=4)
     home.mouse.up()
     scene.until(lambda: seen_as(scene, BELOW) > 5_000, "the underside is darker, and not black")
+    keys = home.locator("[data-first-hint] kbd").first
+    expect(keys).to_be_visible()
+    home.set_viewport_size({"width": 390, "height": 844})
+    expect(keys).to_be_hidden()
+    expect(home.locator("[data-first-hint]")).to_be_visible()
