@@ -19,6 +19,8 @@ from physhandi.errors import MissingInputError
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Frame, Page
 
+BROWSERS = ("chromium", "chromium-browser", "chromium-headless-shell")
+"""Programs that are looked for, in this order; the last one draws no windows, only pages."""
 _FLAGS = ("--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist")
 _SIZE = (1280, 800)
 _PATIENCE_MS = 1e3 * PATIENCE_S
@@ -106,7 +108,7 @@ def open_chromium() -> "Generator[Browser]":
             "Measuring in a browser needs Playwright: pip install playwright. "
             "Or leave these parts out with --parts."
         ) from None
-    executable = shutil.which("chromium") or shutil.which("chromium-browser")
+    executable = next(filter(None, map(shutil.which, BROWSERS)), None)
     if executable is None:
         raise MissingInputError(
             "Measuring in a browser needs Chromium: apt-get install chromium libegl-mesa0 "

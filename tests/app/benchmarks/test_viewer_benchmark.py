@@ -36,7 +36,8 @@ def little(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer, "_QUICK", effort)
     monkeypatch.setattr(streams, "_SETTLING_S", 0.3)
     monkeypatch.setattr(browser, "_COUNTED_MS", 500.0)
-    # Without a graphics card every picture and every pixel costs.
+    # Without a graphics card every picture and every pixel costs, and windows cost more.
+    monkeypatch.setattr(browser, "BROWSERS", browser.BROWSERS[::-1])
     monkeypatch.setattr(browser, "_FLAGS", browser._FLAGS + LESS_DRAWING)
     drawn = COARSER_PICTURES + FEWER_PICTURES
     monkeypatch.setattr(browser, "_WATCH", drawn + browser._WATCH)
