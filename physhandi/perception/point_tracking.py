@@ -1,5 +1,10 @@
 """Follows points of the object through the images of each view, by pyramidal Lucas-Kanade.
 
+What is thin, as a rope is, fills little of any window, and what lies around it would hold its
+points where they are along it. So of thin things only their own pixels are matched, over a long
+piece, and points are laid onto the image in which they began, so that steps do not add up to a
+slide.
+
 A track goes on while it comes back to where it was when followed backwards (Kalal et al. 2010),
 moves as its neighbors do, stays as near to them as a surface can, and its pixel is the object's,
 with a depth that does not jump. One that does not (it hangs on a shadow, say), or that a
@@ -31,8 +36,18 @@ LEAST_TRACKS = 180
 
 _WINDOW = (9, 21)
 """Least and largest side of what of an image is matched [px]."""
-_RETURN = 0.3
-"""Distance from its start at which a track may come back when followed backwards [px]."""
+_THIN, _LONG_WINDOW = 8.0, 41
+"""Thickness up to which an object is thin, and the side of what is matched of nothing but its own
+pixels then [px]."""
+_RETURN, _THIN_RETURN = 0.3, 0.15
+"""Distance from its start at which a track may come back when followed backwards, of thin things
+where the long window gives smaller ones [px]."""
+_SMEAR = 3.0
+"""Radius (standard deviation) from which pixels beside a thin thing take its own values [px]."""
+_FADE = 0.02
+"""Share of its pixels around below which they fade to its mean: no edge is there to be matched."""
+_RETURNED = 3.0
+"""Farthest way by which a thin thing's track is moved to where its first image matches [px]."""
 _DEPTH_JUMP = 0.04
 """Change of depth in one frame that no track survives [m]."""
 _COMPANY = 8
@@ -116,6 +131,8 @@ class _Tracker:
         self._paths: list[_Path] = []
         self._alive: list[int] = []
         self._gray: ndarray = np.zeros((0, 0), dtype=np.uint8)
+        # Own pixels of the frame before and of those in which living tracks began, if thin there.
+        self._own: dict[int, ndarray] = {}
         self._depth = np.zeros(0)
         self._pair = np.zeros((0, 2), dtype=np.int64)
         self._rest = np.zeros(0)
@@ -125,8 +142,10 @@ class _Tracker:
         gray = cv2.cvtColor(self._view.color(frame), cv2.COLOR_RGB2GRAY)
         is_object = self._mask[frame] == OBJECT_LABEL
         depth = _solid_depth(self._view.depth(frame), is_object)
+        if 0 < _thickness(is_object) <= _THIN:
+            self._own[frame] = _own_pixels(gray, is_object)
         if self._alive:
-            self._advance(gray, is_object, depth)
+            self._advance(frame, gray, is_object, depth)
         self._gray = gray
         count, known = len(self._alive), len(self._paths)
         if count < (MOST_TRACKS if not self._paths else LEAST_TRACKS):
@@ -134,18 +153,24 @@ class _Tracker:
             for pixel in _new_points(gray, is_object & (depth > 0), start.reshape(-1, 2)):
                 self._alive.append(len(self._paths))
                 self._paths.append(_Path(frame, [pixel]))
+        used = {frame, *(self._paths[track].begin for track in self._alive)}
+        self._own = {image: own for image, own in self._own.items() if image in used}
         pixel = np.array([self._paths[track].pixel[-1] for track in self._alive])
         self._depth = _at(depth, pixel.reshape(-1, 2))
         self._tie(pixel.reshape(-1, 2), np.array(self._alive, dtype=np.int64) >= known)
 
     def _advance(
         self,
+        frame: int,
         gray: UInt8[ndarray, "row column"],
         is_object: Bool[ndarray, "row column"],
         depth: Float[ndarray, "row column"],
     ) -> None:
         start = np.array([self._paths[track].pixel[-1] for track in self._alive])
-        end, is_found = _follow(self._gray, gray, start, _window_size(is_object))
+        if frame in self._own and frame - 1 in self._own:
+            end, is_found = self._follow_thin(frame, start)
+        else:
+            end, is_found = _follow(self._gray, gray, start, _window_size(is_object))
         here = _at(depth, end)
         is_good = is_found & (_at(is_object, end) > 0)
         is_good &= (here == 0) | (self._depth == 0) | (np.abs(here - self._depth) < _DEPTH_JUMP)
@@ -157,6 +182,25 @@ class _Tracker:
                 self._paths[track].pixel.append(pixel)
                 alive.append(track)
         self._alive = alive
+
+    def _follow_thin(
+        self, frame: int, start: Float[ndarray, "track 2"]
+    ) -> tuple[Float[ndarray, "track 2"], Bool[ndarray, " track"]]:
+        """Follow points of a thin thing, then lay them onto the images in which they began."""
+        before, now = self._own[frame - 1], self._own[frame]
+        end, is_found = _follow(before, now, start, _LONG_WINDOW, returns=_THIN_RETURN)
+        begin = np.array([self._paths[track].begin for track in self._alive])
+        first = np.array([self._paths[track].pixel[0] for track in self._alive])
+        for image in sorted(set(begin[begin < frame - 1].tolist()) & self._own.keys()):
+            mine = np.flatnonzero(begin == image)
+            place, is_same = _follow(
+                self._own[image], now, first[mine], _LONG_WINDOW, end[mine], returns=_THIN_RETURN
+            )
+            is_same &= np.linalg.norm(place - end[mine], axis=1) < _RETURNED
+            end[mine[is_same]] = place[is_same]
+            # What the first image finds again goes on, also where the one before did not.
+            is_found[mine[is_same]] = True
+        return end, is_found
 
     def _points(
         self, pixel: Float[ndarray, "track 2"], depth: Float[ndarray, " track"]
@@ -277,9 +321,29 @@ def _at(image: ndarray, pixel: Float[ndarray, "track 2"]) -> ndarray:
 
 def _window_size(is_object: Bool[ndarray, "row column"]) -> int:
     """Choose what is matched as wide as the object is thick, so that little else gets into it."""
+    return int(np.clip(round(_thickness(is_object)), *_WINDOW)) | 1
+
+
+def _thickness(is_object: Bool[ndarray, "row column"]) -> float:
+    """Tell how thick the object is in most places [px]; 0 if it is not seen."""
     inside = cv2.distanceTransform(is_object.astype(np.uint8), cv2.DIST_L2, 3)
-    thick = 2 * float(np.percentile(inside[is_object], 90)) if is_object.any() else 0.0
-    return int(np.clip(round(thick), *_WINDOW)) | 1
+    return 2 * float(np.percentile(inside[is_object], 90)) if is_object.any() else 0.0
+
+
+def _own_pixels(
+    gray: UInt8[ndarray, "row column"], is_object: Bool[ndarray, "row column"]
+) -> UInt8[ndarray, "row column"]:
+    """Give what is beside the object the values of its pixels around, and farther off their mean.
+
+    A normalized convolution (Knutsson and Westin 1993): nothing that is not the object's is left to
+    be matched, and no outline either, which tells nothing of the motion along a thin thing.
+    """
+    share = is_object.astype(np.float32)
+    own = gray * share
+    total, count = (cv2.GaussianBlur(image, (0, 0), _SMEAR) for image in (own, share))
+    mean = float(own.sum() / share.sum())
+    smeared = (total + _FADE * mean) / (count + _FADE)
+    return np.where(is_object, gray, smeared).astype(np.uint8)
 
 
 def _follow(
@@ -287,15 +351,27 @@ def _follow(
     now: UInt8[ndarray, "row column"],
     start: Float[ndarray, "track 2"],
     size: int,
+    guess: Float[ndarray, "track 2"] | None = None,
+    *,
+    returns: float = _RETURN,
 ) -> tuple[Float[ndarray, "track 2"], Bool[ndarray, " track"]]:
-    """Find points of an image in the next, and whether they come back from there."""
+    """Find points of an image in another, near a guess or where they were, and whether they return.
+
+    With a guess only the full resolution is searched, which a good one does not leave.
+    """
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-    options = {"winSize": (size, size), "maxLevel": 3, "criteria": stop}
+    options: dict[str, Any] = {"winSize": (size, size), "maxLevel": 3, "criteria": stop}
     first = start.astype(np.float32).reshape(-1, 1, 2)
-    end, found, _ = _cv2.calcOpticalFlowPyrLK(before, now, first, None, **options)
-    back, found_back, _ = _cv2.calcOpticalFlowPyrLK(now, before, end, None, **options)
+    there = None
+    if guess is not None:
+        options |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+        there = guess.astype(np.float32).reshape(-1, 1, 2)
+    end, found, _ = _cv2.calcOpticalFlowPyrLK(before, now, first, there, **options)
+    # The way back begins as far from its end as the way there did.
+    back_there = None if guess is None else first + end - guess.reshape(-1, 1, 2).astype(np.float32)
+    back, found_back, _ = _cv2.calcOpticalFlowPyrLK(now, before, end, back_there, **options)
     far = np.linalg.norm((back - first).reshape(-1, 2), axis=1)
-    is_found = (found.reshape(-1) > 0) & (found_back.reshape(-1) > 0) & (far < _RETURN)
+    is_found = (found.reshape(-1) > 0) & (found_back.reshape(-1) > 0) & (far < returns)
     return end.reshape(-1, 2), is_found
 
 

@@ -1,7 +1,14 @@
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from clicked_disc import FRAMES, TOP, cameras, center, write_disc
 
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.sequence import Sequence, ViewMeta
+from physhandi.data.sequence_meta import SequenceMeta
+from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError
 from physhandi.perception import point_tracking
 from physhandi.perception.point_tracking import LEAST_TRACKS, track_points
@@ -113,6 +120,75 @@ def test_tracks_that_slide_over_the_surface_end_since_it_cannot_stretch_so(tmp_p
     assert all_slid > 20
     assert slid < 0.6 * all_slid
     assert stayed > 0.95 * all_stayed
+
+
+def write_strip(folder: Path, step: tuple[float, float]) -> tuple[Sequence, dict[str, np.ndarray]]:
+    """Film a strip, three pixels wide, that slides by a step a frame [px] on a spotted table.
+
+    A camera looks straight down, so its pixels move as the strip does. The table's spots have far
+    more contrast than what is painted along the strip.
+    """
+    frames, height, width = 13, 64, 128
+    row, column = np.mgrid[:height, :width].astype(float)
+    random = np.random.default_rng(4)
+    spots = cv2.GaussianBlur(random.normal(size=(height, width)), (0, 0), 1.2)
+    wave = random.uniform(0, 2 * np.pi, 6)
+    images: dict[str, np.ndarray] = {}
+    label = np.zeros((frames, height, width), dtype=np.uint8)
+    for frame in range(frames):
+        x, y = column - frame * step[0], row - frame * step[1]
+        paint = sum(np.sin(2 * np.pi * x / (9 + 4 * n) + phase) for n, phase in enumerate(wave))
+        share = np.clip(2.0 - np.abs(y - 30), 0, 1) * np.clip(48 - np.abs(x - 60), 0, 1)
+        gray = (1 - share) * (130 + 120 * spots) + share * (150 + 6 * paint)
+        gray += random.normal(size=gray.shape)
+        label[frame] = share > 0.5
+        depth = np.where(label[frame], 480, 500).astype(np.uint16)
+        images[f"views/top/color/{frame:05d}.png"] = np.repeat(
+            gray.clip(0, 255).round().astype(np.uint8)[..., None], 3, axis=-1
+        )
+        images[f"views/top/depth/{frame:05d}.png"] = depth
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = 0.5
+    K = np.array([[200, 0, width / 2], [0, 200, height / 2], [0, 0, 1]])
+    camera = PinholeCamera(K=K, T_world_camera=pose, width=width, height=height)
+    meta = SequenceMeta(
+        name=folder.name,
+        frame_rate=30.0,
+        frame_count=frames,
+        ground_height=0.0,
+        hands=(),
+        views=(ViewMeta(name="top", camera=camera),),
+    )
+    return write_sequence(folder, meta, {}, images=images), {"top": label}
+
+
+@pytest.mark.parametrize("step", [(0.6, 0.0), (-0.5, 0.3)])
+def test_tracks_of_a_thin_thing_go_along_with_it_and_do_not_stay_on_the_table(
+    tmp_path, monkeypatch, step
+):
+    """What is seen around a thin thing fills most of what is matched, and does not move."""
+    sequence, labels = write_strip(tmp_path / "strip", step)
+
+    def left_behind() -> tuple[np.ndarray, np.ndarray]:
+        """How far points are from where the strip carries them, along it and across it [px]."""
+        pixel, is_seen = track_points(sequence, labels)["top"]
+        is_old = is_seen[:-1].sum(axis=0) >= 5
+        begin = is_seen.argmax(axis=0)
+        age = np.arange(len(pixel))[:, None] - begin
+        start = pixel[begin, np.arange(len(begin))]
+        away = pixel - start - age[..., None] * np.asarray(step)
+        assert is_seen.sum(axis=1).min() > 15
+        lasting = is_seen & is_old & (age >= 4)
+        assert lasting.sum() > 60
+        return away[lasting, 0], away[lasting, 1]
+
+    along, across = left_behind()
+    assert np.median(np.abs(along)) < 0.3
+    assert np.percentile(np.abs(along), 90) < 1.0
+    assert np.percentile(np.abs(across), 90) < 0.5
+    monkeypatch.setattr(point_tracking, "_own_pixels", lambda gray, _: gray)
+    along, _ = left_behind()
+    assert np.median(np.abs(along)) > 2.0
 
 
 def test_a_view_without_an_object_has_no_tracks(disc):
