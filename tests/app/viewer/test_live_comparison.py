@@ -71,6 +71,12 @@ def is_done(client: ViewerClient) -> bool:
     return is_ready(client) and told is not None and float(told[1]) > 0
 
 
+def is_as_fitted(client: ViewerClient) -> bool:
+    """Whether the fitted parameters are simulated to their end; the status comes after the list."""
+    texts = client.texts()
+    return is_ready(client) and "nothing: parameters as fitted" in texts and not is_done(client)
+
+
 def is_fitted(client: ViewerClient, side: str, fitted: np.ndarray) -> bool:
     return np.allclose(nodes(client, side), fitted[FRAME], atol=1e-6)
 
@@ -127,7 +133,7 @@ def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
     client.until(lambda: client.visible.get("/object/surface") is True)
     # What was kept is on the screen itself, so that the fit tells more. It may be simulated anew.
     client.set("Steps", "Undo")
-    client.until(lambda: "nothing: parameters as fitted" in client.texts())
+    client.until(lambda: is_as_fitted(client))
     client.set("Steps", "Redo")
     client.until(lambda: is_done(client))
     press(client, "V")
@@ -136,6 +142,7 @@ def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
     press(client, "V")
     client.until(lambda: client.find("Colors of A and B") == "")
     client.set("Steps", "Reset")
+    client.until(lambda: is_as_fitted(client))
     press(client, "V")
     client.until(lambda: client.find("Colors of A and B") != "")
     client.until(lambda: is_fitted(client, "b", fitted))
