@@ -36,7 +36,10 @@ def parallel_transport(
 def rotations(
     start: Float[ndarray, "*batch 3"], end: Float[ndarray, "*batch 3"]
 ) -> Float[ndarray, "*batch 3 3"]:
-    """Give the smallest rotations that turn unit vectors into others."""
+    """Give the smallest rotations that turn unit vectors into others.
+
+    An opposite one is reached by half a turn about some axis across.
+    """
     axis = np.cross(start, end)
     cosine = np.sum(start * end, axis=-1)[..., None, None]
     x, y, z = np.moveaxis(axis, -1, 0)
@@ -44,4 +47,11 @@ def rotations(
     skew = np.stack(
         [np.stack(row, axis=-1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], axis=-2
     )
-    return np.eye(3) + skew + skew @ skew / np.maximum(1.0 + cosine, 1e-6)
+    turn = np.eye(3) + skew + skew @ skew / np.maximum(1.0 + cosine, 1e-6)
+    is_opposite = cosine[..., 0, 0] < -1.0 + 1e-12
+    if is_opposite.any():
+        vector = np.broadcast_to(start, axis.shape)[is_opposite]
+        least = np.eye(3)[np.abs(vector).argmin(axis=-1)]
+        across = unit_across(least, vector)
+        turn[is_opposite] = 2.0 * across[:, :, None] * across[:, None, :] - np.eye(3)
+    return turn

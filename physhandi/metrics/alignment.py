@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 
+from physhandi.best_rotations import best_rotations
+
 CARRIERS = 8
 """Nodes whose common rigid motion carries a point."""
 LEAST_CARRIERS = 3
 """Carriers that determine a rotation; with fewer the carried point is unknown."""
 REACH = 0.03
 """Largest distance in frame 0 at which an observed point carries another [m]."""
-_LINE = 1e-9
-"""Share of the largest spread below which points are taken to lie on a line."""
 
 
 def rigid_transform(
@@ -30,23 +30,6 @@ def rigid_transform(
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     rotation = best_rotations((target - target_mean).T @ (source - source_mean))
     return rotation, target_mean - rotation @ source_mean
-
-
-def best_rotations(covariance: Float[ndarray, "*item 3 3"]) -> Float[ndarray, "*item 3 3"]:
-    """Find the rotation R of each ``Σ target sourceᵀ`` that turns source onto target best."""
-    u, singular, vt = np.linalg.svd(covariance)
-    sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
-    u_proper = u.copy()
-    u_proper[..., :, 2] *= sign[..., None]
-    rotation = u_proper @ vt
-    open_ended = singular[..., 1] <= _LINE * np.maximum(singular[..., 0], 1e-300)
-    for index in np.argwhere(open_ended):
-        place = tuple(index)
-        is_point = singular[place][0] < 1e-18
-        rotation[place] = (
-            np.eye(3) if is_point else _smallest_rotation(vt[place][0], u[place][:, 0])
-        )
-    return rotation
 
 
 def similarity_aligned(
@@ -132,16 +115,3 @@ class _Held:
         turn = best_rotations(np.einsum("pc,pci,pcj->pij", self._weight, target, self._source))
         found = np.einsum("pij,pj->pi", turn, self._offset) + mean
         return np.where(self._is_known[:, None], found, np.nan)
-
-
-def _smallest_rotation(source: ndarray, target: ndarray) -> Float[ndarray, "3 3"]:
-    """Turn one unit vector onto another about the axis perpendicular to both."""
-    cosine = float(source @ target)
-    if cosine < -1 + 1e-12:  # Half a turn; any perpendicular axis will do.
-        least = np.eye(3)[np.abs(source).argmin()]
-        perpendicular = np.cross(source, least)
-        perpendicular /= np.linalg.norm(perpendicular)
-        return 2 * np.outer(perpendicular, perpendicular) - np.eye(3)
-    axis = np.cross(source, target)
-    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)

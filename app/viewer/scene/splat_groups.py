@@ -16,8 +16,9 @@ from scipy.cluster import vq as _vq
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from physhandi.appearance.binding import SplatBinding, polar_rotations
+from physhandi.appearance.binding import SplatBinding
 from physhandi.appearance.splats import Splats
+from physhandi.best_rotations import best_rotations
 
 MOST_GROUPS = 64
 """Most groups of one object."""
@@ -82,7 +83,7 @@ class SplatGroups:
         columns = np.swapaxes(turned, 1, 2).reshape(-1, 3)
         found: ndarray = self._sums @ np.concatenate([columns, node.astype(np.float64)])
         middle, moment = found[: self.count], found[self.count :].reshape(3, self.count, 3)
-        turn = polar_rotations(np.moveaxis(moment, 0, -1), thin=0.0)
+        turn = best_rotations(np.moveaxis(moment, 0, -1), thin=0.0)
         return Rotation.from_matrix(turn).as_quat(scalar_first=True), middle
 
     def place(self, node: Float[ndarray, "node 3"]) -> Float32[ndarray, "splat 3"]:

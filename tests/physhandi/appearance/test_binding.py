@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physhandi.appearance.binding import SplatBinding, polar_rotations
+from physhandi.appearance.binding import SplatBinding
 from physhandi.appearance.splats import Splats
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 2.0])
@@ -101,23 +101,6 @@ def test_mirrored_and_coincident_neighbors_still_give_rotations() -> None:
     )
     np.testing.assert_allclose(np.linalg.det(turned), 1.0)
     np.testing.assert_allclose(turned[1], np.tile(np.eye(3), (57, 1, 1)))
-
-
-@pytest.mark.parametrize("size", [1.0, 1e-6, 1e-12])
-@pytest.mark.parametrize(
-    "extent",
-    [(1, 1, 1), (1, 0.6, 0.2), (1, 0.6, 0), (1, 1, -0.4), (1, 0.02, 0.01), (1, 0.3, -0.2999)],
-    ids=["ball", "body", "sheet", "mirrored", "nearly a line", "in doubt"],
-)
-def test_rotations_are_those_that_moments_are_made_of(
-    extent: tuple[float, float, float], size: float
-) -> None:
-    first, second = (
-        Rotation.random(40, rng=np.random.default_rng(seed)).as_matrix() for seed in (1, 2)
-    )
-    moment = size * (first * extent) @ np.swapaxes(second, 1, 2)
-    turned = polar_rotations(moment)
-    np.testing.assert_allclose(turned, first @ np.swapaxes(second, 1, 2), atol=1e-9)
 
 
 def test_a_frame_is_carried_alike_alone_and_after_others() -> None:
