@@ -210,6 +210,9 @@ class RunFolder:
     @property
     def state(self) -> RunState:
         """How far the run is."""
+        # Looked for before the lease, which an attempt takes first: one that begins between the two
+        # looks has not failed.
+        was_begun = bool(attempt_numbers(self.folder))
         if live_holder(self.folder) is not None:
             return "running"
         end = read_record(self.folder / EXIT, ExitFile)
@@ -219,7 +222,7 @@ class RunFolder:
             return "succeeded"
         if (self.folder / CANCEL).exists():
             return "cancelled"
-        return "failed" if attempt_numbers(self.folder) else "queued"
+        return "failed" if was_begun else "queued"
 
     @property
     def error(self) -> str | None:

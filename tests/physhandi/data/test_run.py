@@ -17,6 +17,7 @@ from waiting import LIMIT_S
 
 from physhandi.data import attempt as attempt_module
 from physhandi.data import lease
+from physhandi.data import run as run_module
 from physhandi.data.files import write_array
 from physhandi.data.run_folder import read_events
 from physhandi.errors import CancelledError, RunError
@@ -99,6 +100,23 @@ def test_a_stolen_lease_forbids_publication(tmp_path: Path) -> None:
     with pytest.raises(RunError, match="taken over"):
         first.publish()
     assert run.out.parent.name == "2"
+
+
+def test_a_run_that_begins_while_it_is_looked_at_has_not_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path / "fit")
+    look = run_module.live_holder
+
+    def begins_after_it(folder: Path) -> object:
+        holder = look(folder)
+        monkeypatch.setattr(run_module, "live_holder", look)
+        run.begin_attempt()
+        return holder
+
+    monkeypatch.setattr(run_module, "live_holder", begins_after_it)
+    assert run.state == "queued"
+    assert run.state == "running"
 
 
 def test_a_claim_of_a_process_that_is_gone_is_void(tmp_path: Path) -> None:
