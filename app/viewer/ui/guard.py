@@ -84,9 +84,12 @@ class Guard:
     def on_event_loop(self, action: Callable[[], None]) -> None:
         """Do something on the event loop, where no message of a user comes between.
 
-        What is handed in first is done first.
+        What is handed in first is done first; after the server has stopped nothing is done.
         """
-        self._server.get_event_loop().call_soon_threadsafe(action)
+        try:
+            self._server.get_event_loop().call_soon_threadsafe(action)
+        except RuntimeError:  # Its event loop is closed, and nobody looks any more.
+            logger.debug("%r came after the server had stopped", action)
 
     def _notify(self, event: Any, title: str, error: Exception) -> None:
         lines = str(error).splitlines() or [type(error).__name__]

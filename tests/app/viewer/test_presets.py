@@ -1,3 +1,4 @@
+import asyncio
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -269,3 +270,15 @@ def test_what_a_list_no_longer_offers_is_followed_again(shown_list) -> None:
     choice.show()
     loop.work()
     assert shown.value == AS_FITTED
+
+
+def test_what_comes_after_the_server_has_stopped_is_let_go() -> None:
+    loop, done = asyncio.new_event_loop(), []
+    server: Any = SimpleNamespace(get_event_loop=lambda: loop)
+    guard = Guard(server)
+    guard.on_event_loop(lambda: done.append("before"))
+    loop.call_soon(loop.stop)
+    loop.run_forever()
+    loop.close()
+    guard.on_event_loop(lambda: done.append("after"))
+    assert done == ["before"]
