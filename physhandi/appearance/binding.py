@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from physhandi.appearance.splats import Splats
-from physhandi.best_rotations import best_rotations
+from physhandi.rotations import best_rotations
 
 NODES_OF_A_SPLAT = 16
 """Nodes that a splat follows, and neighbors by which a node tells how it has turned."""

@@ -18,11 +18,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from physhandi.best_rotations import best_rotations
 from physhandi.data.observation import ObjectObservation
 from physhandi.fitting.rest_state import node_distance
 from physhandi.fitting.search_bounds import neighbor_distance
 from physhandi.metrics.baselines import last_residual, placed_tracks
+from physhandi.rotations import best_rotations
 from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 
 NEAR_HAND, LONGEST_HOLD = 1.5, 4.0

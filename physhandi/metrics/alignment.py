@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from physhandi.best_rotations import best_rotations
+from physhandi.rotations import best_rotations
 
 CARRIERS = 8
 """Nodes whose common rigid motion carries a point."""

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
 
-from physhandi.parallel_transport import parallel_transport, rotations
+from physhandi.rotations import parallel_transport, smallest_rotations
 from physhandi.simulation.surface import is_line, triangulate_nodes, typical_distance
 
 MOST_VERTICES = 4_500
@@ -104,7 +104,9 @@ class Tube:
         """Place the vertices round the middles of their rings [m]."""
         curve = middle.astype(np.float64)
         ahead = self._directions(curve)
-        across = parallel_transport(rotations(self.start[0], ahead[0]) @ self.start[1], ahead)
+        across = parallel_transport(
+            smallest_rotations(self.start[0], ahead[0]) @ self.start[1], ahead
+        )
         other = np.cross(ahead, across)
         angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
         around = across[:, None] * np.cos(angle)[:, None] + other[:, None] * np.sin(angle)[:, None]

@@ -14,8 +14,7 @@ INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.
 """Code that makes the inputs of methods."""
 PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
-    "best_rotations.py",
-    *("parallel_transport.py", "quaternions.py", "adam.py", "one_thread.py", "typed.py"),
+    *("rotations.py", "quaternions.py", "adam.py", "one_thread.py", "typed.py"),
     *("data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     "metrics/truth_metrics.py",
@@ -25,8 +24,8 @@ PREDICTIONS = (
 """Code that makes predictions: fits, rules, corrections and noise."""
 LOOKS = (
     *("appearance", "rendering", "data", "metrics", "perception", "simulation"),
-    *("settings.py", "srgb.py", "triangles.py", "parallel_transport.py", "adam.py"),
-    *("one_thread.py", "typed.py", "best_rotations.py", "fitting/appearance_fit.py"),
+    *("settings.py", "srgb.py", "triangles.py", "rotations.py", "adam.py"),
+    *("one_thread.py", "typed.py", "fitting/appearance_fit.py"),
 )
 """Code that fits what an object looks like, and draws it."""
 SCORES = (

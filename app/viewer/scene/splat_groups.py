@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from physhandi.appearance.binding import SplatBinding
 from physhandi.appearance.splats import Splats
-from physhandi.best_rotations import best_rotations
+from physhandi.rotations import best_rotations
 
 MOST_GROUPS = 64
 """Most groups of one object."""

@@ -16,8 +16,8 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import ImportFailedError, UsageError
-from physhandi.parallel_transport import parallel_transport, unit_across
 from physhandi.progress import NullProgress, Progress
+from physhandi.rotations import parallel_transport, unit_across
 
 _STAGE = "import"
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]

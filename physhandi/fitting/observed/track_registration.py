@@ -15,12 +15,12 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
-from physhandi.best_rotations import best_rotations
 from physhandi.data.observation import ObjectObservation
 from physhandi.fitting.object_problem import TRACK_CARRIERS, attach
 from physhandi.fitting.placement import farthest_points
 from physhandi.metrics.alignment import carried_points
 from physhandi.perception.tracks import motion_validity
+from physhandi.rotations import best_rotations
 
 _MOST_NODES = 500
 """Nodes that are laid onto what was seen; of more these are chosen, far from each other."""

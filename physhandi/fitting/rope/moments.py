@@ -9,7 +9,7 @@ from scipy.interpolate import make_interp_spline
 
 from physhandi.fitting.object_problem import ObjectProblem
 from physhandi.fitting.rope.bending import Bending, rope_model
-from physhandi.parallel_transport import parallel_transport, unit_across
+from physhandi.rotations import parallel_transport, unit_across
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physhandi.best_rotations import best_rotations
+from physhandi.rotations import best_rotations
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-6, 1e-12])
