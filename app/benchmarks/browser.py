@@ -94,6 +94,20 @@ _EXPECT = """([rollout, before, tolerance]) => Object.assign(window.physhandiWat
 })"""
 
 
+def find_chromium(*, draws_windows: bool = True) -> str | None:
+    """Find an installed Chromium.
+
+    Args:
+        draws_windows: Whether one that draws windows is preferred; one that does not takes a third
+            less processor time.
+
+    Returns:
+        Its program; None if there is none.
+    """
+    programs = BROWSERS if draws_windows else reversed(BROWSERS)
+    return next(filter(None, map(shutil.which, programs)), None)
+
+
 @contextmanager
 def open_chromium() -> "Generator[Browser]":
     """Start a headless Chromium.
@@ -108,7 +122,7 @@ def open_chromium() -> "Generator[Browser]":
             "Measuring in a browser needs Playwright: pip install playwright. "
             "Or leave these parts out with --parts."
         ) from None
-    executable = next(filter(None, map(shutil.which, BROWSERS)), None)
+    executable = find_chromium()
     if executable is None:
         raise MissingInputError(
             "Measuring in a browser needs Chromium: apt-get install chromium libegl-mesa0 "

@@ -2,7 +2,6 @@
 
 import io
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -31,7 +30,7 @@ from scene_page import (
 )
 from waiting import LIMIT_S, until
 
-from app.benchmarks.browser import BROWSERS
+from app.benchmarks.browser import find_chromium
 from app.jobs.processes import end_processes
 
 ROOT = Path(__file__).parents[2]
@@ -169,8 +168,7 @@ def playwright_driver() -> Iterator[Playwright]:
 
 @pytest.fixture(scope="package")
 def browser(playwright_driver: Playwright) -> Iterator[Browser]:
-    # One without windows takes two thirds of the processor time.
-    executable = next(filter(None, map(shutil.which, reversed(BROWSERS))), None)
+    executable = find_chromium(draws_windows=False)
     if executable is None:
         reason = "needs Debian's chromium-headless-shell with libegl-mesa0 and libgl1-mesa-dri"
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
