@@ -64,7 +64,10 @@ def _environment(process: psutil.Process) -> dict[str, str]:
     """
     end = time.monotonic() + _LOADING_S
     while not (environment := process.environ()):
-        if not is_loading(Path(f"/proc/{process.pid}/stat").read_text()):
+        stat = Path(f"/proc/{process.pid}/stat").read_text()
+        if not has_memory(stat):
+            break  # It never gets one: there are a hundred of these and more.
+        if not is_loading(stat):
             return process.environ()  # It may have got one after the look at it.
         if time.monotonic() > end:
             break
@@ -72,14 +75,22 @@ def _environment(process: psutil.Process) -> dict[str, str]:
     return environment
 
 
+def has_memory(stat: str) -> bool:
+    """Tell from ``/proc/PID/stat`` whether a process is a program: no zombie or kernel's own."""
+    return _fields(stat)[20] != "0"
+
+
 def is_loading(stat: str) -> bool:
     """Tell from a process's ``/proc/PID/stat`` whether its program is only being loaded.
 
-    It has memory then, unlike the kernel's own processes, but not yet a place of its environment.
+    It has memory then, but not yet a place of its environment.
     """
-    field = stat.rpartition(")")[2].split()
-    size, start_of_environment = field[20], field[47]
-    return size != "0" and start_of_environment == "0"
+    return has_memory(stat) and _fields(stat)[47] == "0"
+
+
+def _fields(stat: str) -> list[str]:
+    """Take what follows the program's name, which may hold anything."""
+    return stat.rpartition(")")[2].split()
 
 
 def end_processes(

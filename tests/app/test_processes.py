@@ -11,7 +11,14 @@ import psutil
 import pytest
 
 from app.jobs import processes
-from app.jobs.processes import COOKIE, cookie_of, end_processes, is_loading, processes_of
+from app.jobs.processes import (
+    COOKIE,
+    cookie_of,
+    end_processes,
+    has_memory,
+    is_loading,
+    processes_of,
+)
 
 SLEEPER = [sys.executable, "-c", "import time; print(flush=True); time.sleep(300)"]
 
@@ -62,11 +69,30 @@ def test_a_program_is_being_loaded_while_it_has_memory_and_no_place_of_its_envir
     assert is_loading(f"{name}) {' '.join(field)}")
     field[20] = "0"  # … which the kernel's own processes have neither, nor memory.
     assert not is_loading(f"{name}) {' '.join(field)}")
+    assert has_memory(own)
     with subprocess.Popen([*SLEEPER], env={}, stdout=subprocess.PIPE) as bare:
         assert bare.stdout is not None
         bare.stdout.readline()
         assert not is_loading(Path(f"/proc/{bare.pid}/stat").read_text())
         bare.kill()
+
+
+def test_what_never_gets_an_environment_is_asked_for_it_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with marked(tmp_path) as process, subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        # A zombie has no memory, like the kernel's own processes, which containers have not.
+        os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
+        asked: list[int] = []
+        real = psutil.Process.environ
+
+        def environ(one: psutil.Process) -> dict[str, str]:
+            asked.append(one.pid)
+            return {} if one.pid == ended.pid else real(one)
+
+        monkeypatch.setattr(psutil.Process, "environ", environ)
+        assert [found.pid for found in processes_of(tmp_path)] == [process.pid]
+        assert asked.count(ended.pid) == asked.count(process.pid) == 1
 
 
 def test_a_process_with_the_number_of_an_earlier_one_is_ended(tmp_path: Path) -> None:
