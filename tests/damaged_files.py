@@ -10,6 +10,8 @@ from typing import Any
 
 import yaml
 
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 Choose = Callable[[Sequence[Any]], Any]
 """Gives one of several."""
 
@@ -73,9 +75,9 @@ def damage_file(path: Path, choose: Choose) -> None:
     deed = choose(("structure",) * 7 + ("bytes", "cut", "odd"))
     is_yaml, is_json = path.suffix == ".yaml", path.suffix == ".json"
     if deed == "structure" and (is_yaml or is_json):
-        content = yaml.safe_load(original) if is_yaml else json.loads(original)
+        content = yaml.load(original, _Loader) if is_yaml else json.loads(original)  # noqa: S506
         content = damage_content(content, choose)
-        path.write_text(yaml.safe_dump(content) if is_yaml else json.dumps(content))
+        path.write_text(yaml.dump(content, Dumper=_Dumper) if is_yaml else json.dumps(content))
     elif deed == "structure" and path.suffix == ".jsonl":
         lines = original.splitlines()
         number = choose(range(len(lines)))

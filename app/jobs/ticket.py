@@ -3,12 +3,24 @@
 import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
+
+import msgspec
 
 from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder, locked
-from physhandi.data.run_folder import CANCEL, EXIT, RESERVE, is_filled, now, read_record
+from physhandi.data.run_folder import (
+    CANCEL,
+    EXIT,
+    RESERVE,
+    Text,
+    WholeNumber,
+    is_filled,
+    now,
+    read_record,
+)
 from physhandi.errors import RunError
+from physhandi.typed import to_typed
 
 QUEUED = "queued.json"
 """File in a run's folder that puts it into the queue; the queue survives a restart."""
@@ -58,6 +70,9 @@ class Ticket:
         return f"{self.why} It was started again ({self.starts} of {MOST_STARTS})."
 
 
+_Field = TypeVar("_Field")
+
+
 def read_ticket(path: Path) -> Ticket | None:
     """Read a ticket; None if there is none. Fields that are damaged are as in a new one."""
     try:
@@ -65,18 +80,24 @@ def read_ticket(path: Path) -> Ticket | None:
             return None
     except RunError:
         return Ticket()
-    time, starts = content.get("time"), content.get("starts")
-    why, device, engine = content.get("why"), content.get("device"), content.get("engine")
-    priority, who = content.get("priority"), content.get("who")
+    priority = content.get("priority")
     return Ticket(
-        time=time if isinstance(time, float) else 0.0,
-        starts=starts if isinstance(starts, int) and starts > 0 else 0,
-        why=why if isinstance(why, str) else "",
-        device=device if isinstance(device, str) else "",
-        engine=engine if isinstance(engine, str) else "",
+        time=_field_of(content, "time", float, 0.0),
+        starts=_field_of(content, "starts", WholeNumber, 0),
+        why=_field_of(content, "why", Text, ""),
+        device=_field_of(content, "device", Text, ""),
+        engine=_field_of(content, "engine", Text, ""),
         priority=next((known for known in get_args(Priority) if known == priority), "normal"),
-        who=who if isinstance(who, str) else "",
+        who=_field_of(content, "who", Text, ""),
     )
+
+
+def _field_of(content: dict[str, Any], name: str, kind: Any, otherwise: _Field) -> _Field:
+    """Take a field if it is what it has to be."""
+    try:
+        return to_typed(content.get(name), kind)
+    except msgspec.ValidationError:
+        return otherwise
 
 
 def nonce_of(run_folder: Path, ticket: Ticket) -> str:

@@ -49,7 +49,8 @@ class PinholeCamera:
                 f"K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], not {self.K.tolist()}"
             )
         rotation = self.T_world_camera[:3, :3]
-        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        is_small = np.abs(rotation).max() < 2.0  # The product of larger ones may have no number.
+        is_rotation = is_small and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
         if not is_rotation or np.linalg.det(rotation) < 0:
             raise ValueError("T_world_camera must hold a rotation (orthonormal, determinant +1)")
         if not np.allclose(self.T_world_camera[3], [0, 0, 0, 1]):

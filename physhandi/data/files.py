@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path, PurePath
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, ClassVar, cast
 
 import numpy as np
 import psutil
@@ -258,15 +258,20 @@ def named_fields(value: Any) -> dict[str, Any] | None:
 _ODD_CHARACTER = (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError)
 
 
-def parse_yaml(text: str) -> Any:
+def parse_yaml(text: str, *, reads_dates: bool = True) -> Any:
     """Read plain data from YAML text; nothing that it names is imported or called.
+
+    Args:
+        text: The text.
+        reads_dates: Whether what is written like a date becomes one; else it is text.
 
     Raises:
         ValueError: If it is not YAML, or a field is there twice; tells the line.
     """
     try:
         _check_depth(text)
-        return yaml.load(text, Loader=_Loader)  # noqa: S506 - a SafeLoader
+        # Both are a SafeLoader.
+        return yaml.load(text, Loader=_Loader if reads_dates else _DatelessLoader)  # noqa: S506
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         if mark and error.context_mark and mark.line > text.count("\n"):
@@ -310,6 +315,15 @@ class _Loader(_FastLoader):
                 )
             seen.add(key.value)
         return _FastLoader.construct_mapping(self, node, deep=deep)
+
+
+class _DatelessLoader(_Loader):
+    """Takes dates for text, as whoever writes one by hand means it."""
+
+    yaml_implicit_resolvers: ClassVar[Any] = {
+        first: [(tag, form) for tag, form in forms if tag != "tag:yaml.org,2002:timestamp"]
+        for first, forms in _FastLoader.yaml_implicit_resolvers.items()
+    }
 
 
 DEEPEST = 100

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.files import named_fields, parse_yaml
+from physhandi.data.files import named_fields, parse_yaml, require_plain
 from physhandi.errors import SequenceError
 
 FORMAT = "physhandi-sequence/1"
@@ -125,7 +125,7 @@ def read_meta(folder: Path) -> SequenceMeta:
     try:
         if path.stat().st_size > _SIZE_LIMIT:
             raise SequenceError(f"{where}: {FILE} is larger than {_SIZE_LIMIT} bytes.", file=FILE)
-        content = parse_yaml(path.read_text(encoding="utf-8"))
+        content = parse_yaml(path.read_text(encoding="utf-8"), reads_dates=False)
     except (FileNotFoundError, NotADirectoryError):
         raise SequenceError(
             f"{where}: {FILE} is missing in {folder}. Give the folder that an importer wrote.",
@@ -168,7 +168,7 @@ def parse_meta(content: Any, where: str) -> SequenceMeta:
         reconstruction=reconstruction,
         controlled_markers=_markers(fields),
         surface_node_count=fields.optional_whole("surface_node_count", least=0),
-        provenance=fields.take("provenance", dict, {}),
+        provenance=_provenance(fields),
         label=fields.take("label", str, ""),
         shape=cast("ShapeClass | None", fields.optional_choice("shape", get_args(ShapeClass))),
         mass=_mass(fields),
@@ -199,6 +199,15 @@ def _markers(fields: "_Fields") -> tuple[int, ...]:
         if type(marker) is not int or marker < 0 or markers.count(marker) > 1:
             fields.fail("controlled_markers", marker, "different marker numbers from 0 on")
     return tuple(markers)
+
+
+def _provenance(fields: "_Fields") -> dict[str, Any]:
+    provenance = fields.take("provenance", dict, {})
+    try:
+        require_plain({"provenance": provenance})
+    except ValueError as error:
+        fields.refuse("provenance", str(error), "plain data: text, finite numbers, lists, fields")
+    return provenance
 
 
 def _views(fields: "_Fields", where: str) -> tuple[ViewMeta, ...]:
@@ -248,8 +257,11 @@ class _Fields:
         self._where = where
 
     def fail(self, field_name: str, value: Any, expected: str) -> None:
+        self.refuse(field_name, f"{field_name} is {_short(value)}", expected)
+
+    def refuse(self, field_name: str, problem: str, expected: str) -> None:
         raise SequenceError(
-            f"{self._where}: {field_name} is {_short(value)}; expected {expected}.",
+            f"{self._where}: {problem}; expected {expected}.",
             file=FILE,
             field=field_name,
             remedy=f"give {expected}",

@@ -1,6 +1,7 @@
 """When a process is taken to hang, what a kill is put down to, and who is started again."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -149,3 +150,15 @@ def test_a_damaged_ticket_is_as_a_new_one(tmp_path: Path, content: str) -> None:
     (tmp_path / QUEUED).write_text(content)
     assert read_ticket(tmp_path / QUEUED) == Ticket()
     assert read_ticket(tmp_path / STARTED) is None
+
+
+def test_each_damaged_field_of_a_ticket_is_as_in_a_new_one(tmp_path: Path) -> None:
+    whole = {"time": 5, "starts": 1, "why": "Lost.", "device": "cpu", "engine": "", "who": "me"}
+    (tmp_path / QUEUED).write_text(json.dumps(whole))
+    ticket = Ticket(5.0, 1, "Lost.", "cpu", who="me")
+    assert read_ticket(tmp_path / QUEUED) == ticket
+    for name, value in (("starts", True), ("starts", -1), ("device", "a\0b"), ("who", "a\0b")):
+        (tmp_path / QUEUED).write_text(json.dumps(whole | {name: value}))
+        expected = replace(ticket, **{name: getattr(Ticket(), name)})
+        # Python takes true for 1.
+        assert repr(read_ticket(tmp_path / QUEUED)) == repr(expected), name

@@ -20,7 +20,7 @@ from app.jobs.recordings import unpacking, upload_names, uploads
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.unpacking import settle, unpack
 from app.jobs.recordings.upload_names import check_names
-from app.jobs.recordings.uploads import NoRoomError, Uploads
+from app.jobs.recordings.uploads import NoRoomError, UnknownUploadError, Uploads
 from app.settings import ServerSettings
 from physhandi.data.run_folder import JOB, read_yaml
 from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
@@ -320,6 +320,24 @@ def test_routes_refuse_what_is_no_upload(world: World) -> None:
     upload = announce(client, "one", {"a": b"x"})
     assert piece(client, upload, 1, 0, b"x").status_code == 404
     assert piece(client, upload, 0, 0, bytes(2**20 + 1)).status_code == 413
+
+
+@pytest.mark.parametrize(
+    "change", [{"name": "a\0b"}, {"files": [["a", -1]]}, {"files": [["a", 2**70]]}]
+)
+def test_an_upload_whose_description_is_damaged_is_none(
+    tmp_path: Path, change: dict[str, object]
+) -> None:
+    settings = ServerSettings(data_dir=tmp_path)
+    sent = Uploads(settings, BackgroundTasks()).begin("take", [("a", 3)])
+    about = tmp_path / "incoming" / sent["id"] / "upload.json"
+    restarted = Uploads(settings, BackgroundTasks())
+    assert restarted.describe(sent["id"]) == sent
+    about.write_text(json.dumps({"name": "take", "files": [["a", 3]]} | change))
+    again = Uploads(settings, BackgroundTasks())
+    assert again.unfinished() == []
+    with pytest.raises(UnknownUploadError):
+        again.describe(sent["id"])
 
 
 def test_an_upload_that_was_left_for_a_week_is_removed(

@@ -15,6 +15,7 @@ with 0 there is only in the long form. ``PYTHONPATH=tests python -m reliability 
 two in their long form and prints their counts, ``--count 5`` with that count.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -23,11 +24,39 @@ from pathlib import Path
 from pkgutil import iter_modules
 
 Report = Mapping[str, float]
-"""What a case counted: ``done``, what of `FAULTS` it looked for, and measures."""
+"""What a case counted: ``done``, what of `FAULTS` it looked for, and measures; see `Counts`."""
 FAULTS = frozenset(
     {"lost", "corrupt", "orphans", "published twice", "wrong", "unanswered", "leaked", "hung"}
 )
 """Counts that must be 0."""
+
+_MOST_FINDINGS = 100
+"""Findings that are kept; more of them tell nothing new."""
+
+
+class Counts(Counter[str]):
+    """What a case has counted so far, and what was found in words, which the page keeps."""
+
+    def __init__(self, *faults: str) -> None:
+        """Begin with 0 of those faults that are looked for."""
+        super().__init__(dict.fromkeys(faults, 0))
+        self.findings: list[str] = []
+        """What went wrong, each with all that is needed to see it again."""
+
+    def find(self, fault: str, finding: str) -> None:
+        """Count a fault and keep what it was."""
+        self[fault] += 1
+        if len(self.findings) < _MOST_FINDINGS:
+            self.findings.append(finding)
+
+    def require(self, is_so: bool, otherwise: str) -> None:
+        """Count as wrong what is not so, and keep what is said of it."""
+        if not is_so:
+            self.find("wrong", otherwise)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Send findings to another process, too."""
+        return Counts, (), {"findings": self.findings}, None, iter(self.items())
 
 
 @dataclass(frozen=True)

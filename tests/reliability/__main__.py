@@ -14,7 +14,7 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
-from reliability import Case, Report, all_cases, faults_of, in_order
+from reliability import Case, Counts, Report, all_cases, faults_of, in_order
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
 _HEAD = """# Reliability
@@ -28,6 +28,8 @@ want a processor, when the case began and when it ended; it was not the only wor
 | case | what is done | counted | faults | s | when and where |
 | --- | --- | --- | --- | --- | --- |
 """
+_LONGEST = 300
+"""Letters of what was found that the page keeps."""
 
 
 def main() -> int:
@@ -59,6 +61,8 @@ def main() -> int:
         faults = faults_of(count, report)
         is_well &= not faults
         sys.stdout.write(f"{name} {json.dumps(dict(report))} in {seconds:.0f} s {faults or ''}\n")
+        findings = report.findings if isinstance(report, Counts) else []
+        sys.stdout.writelines(f"{name} found: {finding}\n" for finding in findings)
         sys.stdout.flush()
         if asked.page:
             where = (
@@ -67,7 +71,7 @@ def main() -> int:
             where += (
                 f"Python {platform.python_version()}, load {load:.0f} to {os.getloadavg()[0]:.0f}"
             )
-            row = _row(name, case, report, seconds, faults, where)
+            row = row_of(name, case, report, seconds, [*faults, *map(short, findings)], where)
             text = PAGE.read_text(encoding="utf-8")
             PAGE.write_text(_HEAD + merged(text, {name: row}), encoding="utf-8")
     return 0 if is_well else 1
@@ -80,9 +84,16 @@ def merged(page: str, rows: dict[str, str]) -> str:
     return "".join(row + "\n" for _, row in both)
 
 
-def _row(
+def short(finding: str) -> str:
+    """Make of a finding what fits into a row; all of it is printed."""
+    text = " ".join(finding.split()).replace("|", r"\|")
+    return text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
+
+
+def row_of(
     name: str, case: Case, report: Report, seconds: float, faults: list[str], where: str
 ) -> str:
+    """Write the row of a case."""
     counted = ", ".join(f"{key} {value:.10g}" for key, value in report.items())
     told = "; ".join(faults) or "0"
     return f"| {name} | {case.about} | {counted} | {told} | {seconds:.0f} | {where} |"

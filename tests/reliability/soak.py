@@ -1,9 +1,7 @@
 """A server that is used for hours: fits, simulations, scenes, files, pages and uploads."""
 
 import shutil
-import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from app.jobs.ticket import QUEUED, STARTED
 from app.settings import ServerSettings
 from physhandi.data.run_folder import read_events
 from physhandi.run import Run
-from reliability import Case, Report
+from reliability import Case, Counts, Report
 from reliability.jobs import is_damaged
 from reliability.viewers import CUTS, POOL
 
@@ -51,8 +49,7 @@ class Soak:
         self._chance = np.random.default_rng(119)  # Begins with what is quickly done.
         self._runs = [fit_sheet(folder / "runs" / "first", self._sheet).id]
         self._server = MeasuredServer(folder)
-        self.counts: Counter[str] = Counter(lost=0, corrupt=0, orphans=0, wrong=0, leaked=0)
-        self.counts["published twice"] = 0
+        self.counts = Counts("lost", "corrupt", "orphans", "wrong", "leaked", "published twice")
 
     def __enter__(self) -> "Soak":
         return self
@@ -76,7 +73,10 @@ class Soak:
         listed = self._server.told("GET", "/api/v1/runs?limit=200")["runs"]
         own = {run["id"]: run["state"] for run in listed if not run["is_bundled"]}
         self.counts["lost"] += len(own.keys() ^ set(self._runs))
-        self._require({*own.values()} == {"succeeded"}, f"runs: {own}")
+        self.counts.require(
+            {*own.values()} == {"succeeded"},
+            f"GET /api/v1/runs tells {own}; expected that all have succeeded",
+        )
 
     def settled(self) -> Held:
         """Count what the server holds when all of it is over."""
@@ -95,23 +95,29 @@ class Soak:
         counts["leaked"] += grown > _ONCE_MB + _A_REQUEST_MB * self._server.requests
         left = find_left_behind(self._settings)
         counts["leaked"] += len(left.temporaries) + len(left.claims) + len(left.replaced)
-        return {
-            **counts,
-            "requests": self._server.requests,
-            "memory after warming up [MB]": round(warm.megabytes),
-            "at the end": round(end.megabytes),
-            "files open then": warm.files,
-            "files open at the end": end.files,
-            "threads then": warm.threads,
-            "threads at the end": end.threads,
-            "children": end.children,
-        }
+        counts.update(
+            {
+                "requests": self._server.requests,
+                "memory after warming up [MB]": round(warm.megabytes),
+                "at the end": round(end.megabytes),
+                "files open then": warm.files,
+                "files open at the end": end.files,
+                "threads then": warm.threads,
+                "threads at the end": end.threads,
+                "children": end.children,
+            }
+        )
+        return counts
 
-    def _require(self, is_so: bool, otherwise: str) -> None:
-        """Count as wrong what is not so, and say it."""
-        if not is_so:
-            self.counts["wrong"] += 1
-            sys.stderr.write(otherwise + "\n")
+    def _ask(self, deed: str, path: str, *, method: str = "GET", granted: int = 200) -> bytes:
+        """Ask for something that has to be granted; what is not is kept with its request."""
+        status, content = self._server.ask(method, path)
+        self.counts.require(
+            status == granted and bool(content),
+            f"{deed}, request {self._server.requests}: {method} {path} was answered by {status} "
+            f"{content[:300]!r}; expected {granted} and some content",
+        )
+        return content
 
     def _launch(self, name: str, **overrides: Any) -> Run:
         body = {"sequences": ["sheet"], "name": name, "overrides": {**SETTINGS, **overrides}}
@@ -145,11 +151,19 @@ class Soak:
         run = self._launch("to be cancelled", **{"object_.search.generations": 50})
         reports = int(self._chance.integers(0, 4))
         until(lambda: len(read_events(run.folder)[0]) >= reports)
-        status, _ = self._server.ask("POST", f"/api/v1/runs/{run.id}/cancel")
+        status, content = self._server.ask("POST", f"/api/v1/runs/{run.id}/cancel")
         state = self._await_end(run)
         # One that had ended already has nothing to cancel.
-        self._require((state, status) in {("cancelled", 200), ("succeeded", 409)}, f"{state}")
-        self._require(run.is_published == (state == "succeeded"), f"published, {state}")
+        self.counts.require(
+            (state, status) in {("cancelled", 200), ("succeeded", 409)},
+            f"POST /api/v1/runs/{run.id}/cancel after {reports} reports was answered by {status} "
+            f"{content[:300]!r}, and the run is {state}; expected 200 and cancelled, or 409 and "
+            "succeeded",
+        )
+        self.counts.require(
+            run.is_published == (state == "succeeded"),
+            f"run {run.id} is {state}, and {'' if run.is_published else 'not '}published",
+        )
         self._server.told("DELETE", f"/api/v1/runs/{run.id}")
         self.counts["cancelled"] += 1
 
@@ -195,18 +209,12 @@ class Soak:
 
     def _export(self) -> None:
         for kind in _FILES:
-            status, content = self._server.ask(
-                "GET", f"/api/v1/runs/{self._some_run()}/export?format={kind}"
-            )
-            self._require(
-                status == 200 and bool(content), f"export {kind}: {status} {content[:300]!r}"
-            )
+            self._ask("export", f"/api/v1/runs/{self._some_run()}/export?format={kind}")
             self.counts["files"] += 1
 
     def _look(self) -> None:
         for page in _PAGES:
-            status, content = self._server.ask("GET", page.format(run=self._some_run()))
-            self._require(status == 200, f"{page}: {status} {content[:300]!r}")
+            self._ask("page", page.format(run=self._some_run()))
             self.counts["pages"] += 1
 
     def _upload(self) -> None:
@@ -216,9 +224,10 @@ class Soak:
         self._server.told("POST", f"{address}/finish", {})
         until(lambda: self._server.told("GET", address)["state"] != "checking", interval=0.1)
         told = self._server.told("GET", address)
-        self._require(told["state"] == "done", f"upload: {told}")
-        status, _ = self._server.ask("GET", "/api/v1/sequences/sent")
-        self._require(status == 200, f"sequence that was sent: {status}")
+        self.counts.require(
+            told["state"] == "done", f"GET {address} tells {told}; expected that it is done"
+        )
+        self._ask("sequence that was sent", "/api/v1/sequences/sent")
         shutil.rmtree(self._settings.sequence_dir / "sent")
         self.counts["uploads"] += 1
 
@@ -241,17 +250,17 @@ class Soak:
 def soak(seconds: float, folder: Path, *, most: int | None = None) -> Report:
     """Use a server for some time, or so many times, and count what it holds in the end."""
     end = time.monotonic() + seconds
-    done = 0
     with Soak(folder) as used:
         warm = None
         for deed in used.deeds():
+            done = used.counts["done"]
             if done == most if most is not None else time.monotonic() >= end:
                 break
             deed()
-            done += 1
-            if done == min(_WARM, most or _WARM):
+            used.counts["done"] += 1
+            if used.counts["done"] == min(_WARM, most or _WARM):
                 warm = used.settled()
-        return {"done": done, **used.judge(warm or used.settled())}
+        return used.judge(warm or used.settled())
 
 
 def use_often(count: int, folder: Path) -> Report:

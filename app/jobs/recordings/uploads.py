@@ -22,7 +22,7 @@ from app.jobs.recordings.upload_names import check_names, is_left_out, quoted_na
 from app.jobs.storage.room import NoRoomError, Room
 from app.settings import ServerSettings
 from physhandi.data.files import write_json
-from physhandi.data.run_folder import checked, read_json
+from physhandi.data.run_folder import Text, WholeNumber, checked, read_json
 from physhandi.errors import RunError, UsageError
 
 logger = logging.getLogger(__name__)
@@ -43,8 +43,8 @@ class UnknownUploadError(UsageError, NotFoundError):
 class _AboutFile(TypedDict):
     """``upload.json``: what was announced."""
 
-    name: str
-    files: list[tuple[str, int]]
+    name: Text
+    files: list[tuple[Text, WholeNumber]]
 
 
 class Uploads:

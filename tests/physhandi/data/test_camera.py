@@ -83,6 +83,7 @@ def test_dict_round_trip() -> None:
         ({"focal": 3}, "unknown field 'focal'"),
         ({"T_world_camera": np.diag([2.0, 1, 1, 1]).tolist()}, "must hold a rotation"),
         ({"T_world_camera": np.diag([-1.0, 1, 1, 1]).tolist()}, "must hold a rotation"),
+        ({"T_world_camera": np.diag([1e308, 1, 1, 1]).tolist()}, "must hold a rotation"),
         ({"height": 0}, "must be positive"),
     ],
 )

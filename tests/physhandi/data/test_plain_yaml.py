@@ -1,5 +1,7 @@
 """YAML: what is read, and how what is not is told."""
 
+from datetime import date
+
 import pytest
 
 from physhandi.data.files import parse_yaml
@@ -32,3 +34,10 @@ def test_plain_data_is_read() -> None:
 def test_the_rest_is_told_by_its_line(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_yaml(text)
+
+
+def test_what_looks_like_a_date_is_text_where_no_dates_are_read() -> None:
+    text = "a: 2020-01-02\nb: 2001-99-99\nc: !!timestamp 2020-01-02\nd: 7\n"
+    content = parse_yaml(text, reads_dates=False)
+    expected = {"a": "2020-01-02", "b": "2001-99-99", "c": date(2020, 1, 2), "d": 7}
+    assert content == expected

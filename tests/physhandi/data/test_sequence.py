@@ -396,3 +396,26 @@ def test_yaml_of_another_kind_is_refused(folder: Path, text: str) -> None:
     (folder / "sequence.yaml").write_text(text)
     with pytest.raises(SequenceError, match=r"sequence.yaml"):
         Sequence.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ("at: !!timestamp 2026-01-01", "'provenance.at' is a date"),
+        ("at: .nan", "'provenance.at' is nan"),
+        ("at: !!binary aGk=", "'provenance.at' is a bytes"),
+        ("at: &a [*a]", "nested too deeply"),
+        ("at: {1: 2}", "name in field 'provenance.at' is no text"),
+    ],
+)
+def test_where_a_sequence_comes_from_is_told_in_plain_data(
+    folder: Path, told: str, message: str
+) -> None:
+    path = folder / "sequence.yaml"
+    kept = {k: v for k, v in yaml.safe_load(path.read_text()).items() if k != "provenance"}
+    begin = yaml.safe_dump(kept)
+    path.write_text(f"{begin}provenance: {{at: 2026-01-01}}\n")
+    assert Sequence.load(folder).provenance == {"at": "2026-01-01"}
+    path.write_text(f"{begin}provenance:\n  {told}\n")
+    with pytest.raises(SequenceError, match=message):
+        Sequence.load(folder)
