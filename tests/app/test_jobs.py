@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from waiting import LIMIT_S, until
+from waiting import LIMIT_S, WatchedLock, until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
@@ -22,7 +22,7 @@ from app.jobs.engines.device_choice import DeviceChoice
 from app.jobs.machine import Cards
 from app.jobs.processes import end_processes, processes_of, supervisor_of
 from app.jobs.scheduler import JobView, Scheduler
-from app.jobs.ticket import STARTED, read_ticket
+from app.jobs.ticket import STARTED, Ticket, read_ticket
 from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import read_events
@@ -464,6 +464,29 @@ def test_the_worker_never_learns_the_token(desk: Desk, monkeypatch: pytest.Monke
     run_id = desk.launch("stubborn")
     worker, _ = pids_of(desk.run(run_id))
     assert "PHYSHANDI_TOKEN" not in psutil.Process(worker).environ()
+
+
+def test_a_run_that_is_not_in_line_yet_is_not_told_as_failed(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk, lock = Desk(data_dir), WatchedLock()
+    monkeypatch.setattr(desk.scheduler, "_lock", lock)
+    real = scheduler_module.put_in_line
+    seen: list[str] = []
+    visitors: list[threading.Thread] = []
+
+    def put_in_line(folder: Path, ticket: Ticket) -> None:
+        # Its folder is there. Somebody looks now, and has to wait for whoever makes it.
+        visitor = threading.Thread(target=lambda: seen.append(desk.state(folder.name)))
+        visitor.start()
+        until(lambda: visitor.ident in lock.waiting or not visitor.is_alive())
+        real(folder, ticket)
+        visitors.append(visitor)
+
+    monkeypatch.setattr(scheduler_module, "put_in_line", put_in_line)
+    desk.launch("new")
+    visitors[0].join(LIMIT_S)
+    assert seen == ["queued"]
 
 
 def test_a_sweep_spares_the_run_that_is_just_being_started(
