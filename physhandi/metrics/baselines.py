@@ -93,6 +93,40 @@ def last_residual(  # noqa: PLR0917  (the object at two times, then what was see
     Raises:
         ValueError: If the frame shows no track whose place on the object is known.
     """
+    anchor, residual = track_residuals(start, now, point, is_visible, frame, node_of_track)
+    tree: Any = KDTree(anchor)
+    count = min(CARRIERS, len(anchor))
+    distance, near = tree.query(start.astype(np.float64), k=count)
+    weight = 1.0 / (np.reshape(distance, (-1, count)) + 1e-6)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.einsum("nc,nci->ni", weight, residual[np.reshape(near, (-1, count))])
+
+
+def track_residuals(  # noqa: PLR0917  (the object at two times, then what was seen of it)
+    start: Float[ndarray, "node 3"],
+    now: Float[ndarray, "node 3"],
+    point: Float[ndarray, "frame track 3"],
+    is_visible: Bool[ndarray, "frame track"],
+    frame: int,
+    node_of_track: Int[ndarray, " track"] | None = None,
+) -> tuple[Float[ndarray, "seen 3"], Float[ndarray, "seen 3"]]:
+    """Tell what a frame's tracks are away from where the nodes put them.
+
+    Args:
+        start: Nodes in frame 0 [m].
+        now: Nodes in the frame [m].
+        point: Observed tracks [m].
+        is_visible: Whether a track is visible.
+        frame: The frame.
+        node_of_track: Node that each track observes; None lets the nodes around it carry it.
+
+    Returns:
+        Of the tracks that are seen and whose place is known: their places in frame 0 and their
+        residuals [m].
+
+    Raises:
+        ValueError: If the frame shows no track whose place on the object is known.
+    """
     start, now = start.astype(np.float64), now.astype(np.float64)
     is_placed, place = placed_tracks(start, point, is_visible, node_of_track)
     is_usable = is_placed[frame]
@@ -103,13 +137,7 @@ def last_residual(  # noqa: PLR0917  (the object at two times, then what was see
         predicted = now[node_of_track[is_usable]]
     else:
         predicted = carried_points(anchor, np.stack([start, now]))[1]
-    residual = point[frame, is_usable] - predicted
-    tree: Any = KDTree(anchor)
-    count = min(CARRIERS, len(anchor))
-    distance, near = tree.query(start, k=count)
-    weight = 1.0 / (np.reshape(distance, (-1, count)) + 1e-6)
-    weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("nc,nci->ni", weight, residual[np.reshape(near, (-1, count))])
+    return anchor, point[frame, is_usable] - predicted
 
 
 def placed_tracks(

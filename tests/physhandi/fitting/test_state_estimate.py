@@ -106,3 +106,68 @@ def test_without_a_track_there_is_no_state() -> None:
     seen[LAST] = False
     with pytest.raises(MissingInputError, match="frame 2 shows no track"):
         estimate(observed(np.zeros((8, 3)), is_visible=seen))
+
+
+GRID = np.stack(np.meshgrid(np.arange(8), np.arange(6), indexing="ij"), axis=-1).reshape(-1, 2)
+SHEET = np.concatenate([0.01 * GRID, np.full((48, 1), 0.5)], axis=1)
+BESIDE = SHEET + np.array([0.002, 0.001, 0.0])
+HELD = 19
+
+
+def moved_sheet(residual: np.ndarray, hidden: np.ndarray, *, is_held: bool = False):
+    """Estimate where a sheet is that rests in the air; tracks beside its nodes moved at last.
+
+    Args:
+        residual: What each track moved by from frame 1 to frame 2 [m].
+        hidden: Tracks that frame 2 does not show.
+        is_held: Whether a spring, at rest, holds node `HELD` to a hand.
+    """
+    scene = bare_scene(SHEET, frames=3)
+    if is_held:
+        hand = np.tile(SHEET[HELD] + [0.0, 0.0, 0.01], (3, 1, 1))
+        one = np.ones(1)
+        spring = {"springs": np.array([[48, HELD]]), "rest": 0.01 * one, "damping": 0.0 * one}
+        scene = replace(scene, control=hand, stiffness=1e-6 * one, **spring)
+    point = np.stack([BESIDE, BESIDE, BESIDE + residual]).astype(np.float32)
+    seen = np.ones(point.shape[:2], bool)
+    seen[2, hidden] = False
+    model, parameters = as_model(scene)
+    observation = ObjectObservation(point=point, is_visible=seen, is_motion_valid=seen)
+    return observed_state(model, parameters, scene.control, observation, 2).position
+
+
+def gaussian_mean(node: np.ndarray, place: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Weigh one value after the other by exp(-d^2 / 2 w^2)."""
+    distance = [float(np.sqrt(((node - at) ** 2).sum())) for at in place]
+    width = max(0.75 * 0.01, sorted(distance)[7] / 2)
+    weight = [np.exp(-0.5 * (far / width) ** 2) for far in distance]
+    return sum(w * v for w, v in zip(weight, value, strict=True)) / sum(weight)
+
+
+def test_a_node_takes_the_mean_of_the_tracks_around_it_weighted_by_a_gaussian() -> None:
+    noise = np.random.default_rng(4).normal(0, 0.002, (48, 3))
+    hidden = np.zeros(48, bool)
+    hidden[[7, 8, 13, 14]] = True
+    found = moved_sheet(noise, hidden)
+    expected = [gaussian_mean(node, BESIDE[~hidden], noise[~hidden]) for node in SHEET]
+    np.testing.assert_allclose(found, SHEET + expected, atol=2e-6)
+    # Noise of single tracks is more than halved.
+    assert 1e-4 < np.std(found - SHEET) < 0.5 * np.std(noise)
+
+
+def test_what_a_hand_hides_is_where_the_rollout_has_it() -> None:
+    residual = np.tile([0.004, -0.002, 0.003], (48, 1))
+    far = np.linalg.norm(BESIDE - SHEET[HELD], axis=1)
+    is_seen = far > 0.012
+    free = moved_sheet(residual, ~is_seen)
+    np.testing.assert_allclose(free, SHEET + residual, atol=2e-6)
+    held = moved_sheet(residual, ~is_seen, is_held=True)
+    place = np.concatenate([BESIDE[is_seen], SHEET[[HELD]]])
+    value = np.concatenate([residual[is_seen], np.zeros((1, 3))])
+    expected = [gaussian_mean(node, place, value) for node in SHEET]
+    np.testing.assert_allclose(held, SHEET + expected, atol=2e-6)
+    moved = np.linalg.norm(held - SHEET, axis=1)
+    assert moved[HELD] < 0.8 * np.linalg.norm(residual[0]) < 0.999 * moved.max()
+    # A track within a node distance shows it; then the hand says nothing.
+    shown = moved_sheet(residual, far < 0.001, is_held=True)
+    np.testing.assert_allclose(shown, SHEET + residual, atol=2e-6)
