@@ -5,11 +5,11 @@ points where they are along it. So of thin things only their own pixels are matc
 piece, and points are laid onto the image in which they began, so that steps do not add up to a
 slide.
 
-A track goes on while it comes back to where it was when followed backwards (Kalal et al. 2010),
-moves as its neighbors do, stays as near to them as a surface can, and its pixel is the object's,
-with a depth that does not jump. One that does not (it hangs on a shadow, say), or that a
-hand covers, ends; new ones begin where the object shows room for them. A track model, where the
-user has one, follows the points in the place of that.
+A track goes on while it comes back to where it was when followed backwards (Kalal et al. 2010), is
+still found in the image in which it began, moves as its neighbors do, stays as near to them as a
+surface can, and its pixel is the object's, with a depth that does not jump. One that does not (it
+hangs on a shadow, say), or that a hand covers, ends; new ones begin where the object shows room for
+them. A track model, where the user has one, follows the points in the place of that.
 """
 
 from dataclasses import dataclass, field
@@ -47,7 +47,10 @@ _SMEAR = 3.0
 _FADE = 0.02
 """Share of its pixels around below which they fade to its mean: no edge is there to be matched."""
 _RETURNED = 3.0
-"""Farthest way by which a thin thing's track is moved to where its first image matches [px]."""
+"""Farthest way by which a track is moved to where the image in which it began matches [px]."""
+_FIRST_RETURN = 1.5
+"""Distance from where it began at which a track of a thick thing may come back when followed from
+there and backwards: the surface has turned and bent since [px]."""
 _DEPTH_JUMP = 0.04
 """Change of depth in one frame that no track survives [m]."""
 _COMPANY = 8
@@ -62,7 +65,7 @@ _STRETCH_ERROR = 0.008
 """Error of measured distances [m]."""
 _TORN = 0.25
 """Share of the tracks around it that a sliding one leaves behind."""
-_CLOSEST = 2.5
+_CLOSEST = 1.4
 """Least distance between tracks when they begin [px]."""
 _SHORTEST = 3
 """Frames that a track must live to be kept."""
@@ -130,8 +133,9 @@ class _Tracker:
         self._view, self._mask = view, mask
         self._paths: list[_Path] = []
         self._alive: list[int] = []
-        self._gray: ndarray = np.zeros((0, 0), dtype=np.uint8)
-        # Own pixels of the frame before and of those in which living tracks began, if thin there.
+        # Of the frame before and of those in which living tracks began: gray images, and the own
+        # pixels of what is thin there.
+        self._gray: dict[int, ndarray] = {}
         self._own: dict[int, ndarray] = {}
         self._depth = np.zeros(0)
         self._pair = np.zeros((0, 2), dtype=np.int64)
@@ -144,9 +148,9 @@ class _Tracker:
         depth = _solid_depth(self._view.depth(frame), is_object)
         if 0 < _thickness(is_object) <= _THIN:
             self._own[frame] = _own_pixels(gray, is_object)
+        self._gray[frame] = gray
         if self._alive:
-            self._advance(frame, gray, is_object, depth)
-        self._gray = gray
+            self._advance(frame, is_object, depth)
         count, known = len(self._alive), len(self._paths)
         if count < (MOST_TRACKS if not self._paths else LEAST_TRACKS):
             start = np.array([self._paths[track].pixel[-1] for track in self._alive])
@@ -154,7 +158,9 @@ class _Tracker:
                 self._alive.append(len(self._paths))
                 self._paths.append(_Path(frame, [pixel]))
         used = {frame, *(self._paths[track].begin for track in self._alive)}
-        self._own = {image: own for image, own in self._own.items() if image in used}
+        for images in (self._gray, self._own):
+            for image in images.keys() - used:
+                del images[image]
         pixel = np.array([self._paths[track].pixel[-1] for track in self._alive])
         self._depth = _at(depth, pixel.reshape(-1, 2))
         self._tie(pixel.reshape(-1, 2), np.array(self._alive, dtype=np.int64) >= known)
@@ -162,15 +168,23 @@ class _Tracker:
     def _advance(
         self,
         frame: int,
-        gray: UInt8[ndarray, "row column"],
         is_object: Bool[ndarray, "row column"],
         depth: Float[ndarray, "row column"],
     ) -> None:
         start = np.array([self._paths[track].pixel[-1] for track in self._alive])
+        is_young = np.array([self._paths[track].begin == frame - 1 for track in self._alive])
         if frame in self._own and frame - 1 in self._own:
-            end, is_found = self._follow_thin(frame, start)
+            end, is_found = _follow(
+                self._own[frame - 1], self._own[frame], start, _LONG_WINDOW, returns=_THIN_RETURN
+            )
+            is_same = self._laid_onto_beginning(self._own, frame, end, _LONG_WINDOW, _THIN_RETURN)
+            # What the first image finds again goes on, also where the one before did not.
+            is_found |= is_same
         else:
-            end, is_found = _follow(self._gray, gray, start, _window_size(is_object))
+            size = _window_size(is_object)
+            end, is_found = _follow(self._gray[frame - 1], self._gray[frame], start, size)
+            is_same = self._laid_onto_beginning(self._gray, frame, end, size, _FIRST_RETURN)
+            is_found &= is_same | is_young
         here = _at(depth, end)
         is_good = is_found & (_at(is_object, end) > 0)
         is_good &= (here == 0) | (self._depth == 0) | (np.abs(here - self._depth) < _DEPTH_JUMP)
@@ -183,24 +197,27 @@ class _Tracker:
                 alive.append(track)
         self._alive = alive
 
-    def _follow_thin(
-        self, frame: int, start: Float[ndarray, "track 2"]
-    ) -> tuple[Float[ndarray, "track 2"], Bool[ndarray, " track"]]:
-        """Follow points of a thin thing, then lay them onto the images in which they began."""
-        before, now = self._own[frame - 1], self._own[frame]
-        end, is_found = _follow(before, now, start, _LONG_WINDOW, returns=_THIN_RETURN)
+    def _laid_onto_beginning(
+        self,
+        images: dict[int, ndarray],
+        frame: int,
+        end: Float[ndarray, "track 2"],
+        size: int,
+        returns: float,
+    ) -> Bool[ndarray, " track"]:
+        """Move tracks to where the images in which they began are found; tells which are."""
         begin = np.array([self._paths[track].begin for track in self._alive])
         first = np.array([self._paths[track].pixel[0] for track in self._alive])
-        for image in sorted(set(begin[begin < frame - 1].tolist()) & self._own.keys()):
+        is_same = np.zeros(len(end), dtype=bool)
+        for image in sorted(set(begin[begin < frame - 1].tolist()) & images.keys()):
             mine = np.flatnonzero(begin == image)
-            place, is_same = _follow(
-                self._own[image], now, first[mine], _LONG_WINDOW, end[mine], returns=_THIN_RETURN
+            place, is_found = _follow(
+                images[image], images[frame], first[mine], size, end[mine], returns=returns
             )
-            is_same &= np.linalg.norm(place - end[mine], axis=1) < _RETURNED
-            end[mine[is_same]] = place[is_same]
-            # What the first image finds again goes on, also where the one before did not.
-            is_found[mine[is_same]] = True
-        return end, is_found
+            is_found &= np.linalg.norm(place - end[mine], axis=1) < _RETURNED
+            end[mine[is_found]] = place[is_found]
+            is_same[mine] = is_found
+        return is_same
 
     def _points(
         self, pixel: Float[ndarray, "track 2"], depth: Float[ndarray, " track"]

@@ -112,6 +112,8 @@ _FLESH = 0.025
 half of a palm's thickness, and what depth and keypoints err by."""
 _AGREEMENT = 0.18
 """Views agree about a keypoint that all see within this share of the hand's size in the image."""
+_APART = 0.08
+"""Distance from which the middles of one hand, as two views show it, are not the same place [m]."""
 _ROUNDS = 4
 """Times that colors and labels of a view's first frame are found from each other."""
 _CLICK_RADIUS = 0.012
@@ -238,6 +240,7 @@ def segment(
             found.append(_Seen(view, sequence, keypoint))
     for seen in found:
         seen.others = [other for other in found if other is not seen and other.view.has_depth]
+    _leave_out_wrong_hands(found)
     _place_hands(sequence, found)
     clicked = [seen for seen in found if any(click.view == seen.view.name for click in clicks)]
     done, total = 0, len(found) * sequence.frame_count
@@ -288,6 +291,7 @@ def carry_on(
     views = [view for view in sequence.views if view.name in right]
     result: dict[str, ndarray] = {}
     found = [_Seen(view, sequence, _keypoints(view, sequence, progress)) for view in views]
+    _leave_out_wrong_hands(found)
     _place_hands(sequence, found)
     for number, (view, seen) in enumerate(zip(views, found, strict=True)):
         seen.label[:] = masks[view.name]
@@ -917,6 +921,50 @@ def _hand_anchors(
             if (carried == value).sum() >= _LEAST_OBJECT:
                 anchors[value] = _Anchor(np.zeros(carried.shape, dtype=bool), carried == value)
     return anchors
+
+
+def _leave_out_wrong_hands(found: Many[_Seen]) -> None:
+    """Drop keypoints that depth puts elsewhere than those of a view that is surer of its hand.
+
+    A detector may take something for a hand that is none, the object's pattern for instance. The
+    view is then shown the hand by the others, like one in which none was detected.
+    """
+    known = [seen for seen in found if seen.keypoint is not None and seen.view.has_depth]
+    if len(known) < 2:
+        return
+    keypoint = np.stack([np.asarray(seen.keypoint) for seen in known])
+    # Over the whole recording: a wrong hand is found in few frames, but may be sure in some.
+    trust = np.nan_to_num(keypoint[..., 2]).mean(axis=(1, 3))
+    for frame, hand in np.ndindex(*keypoint.shape[1:3]):
+        middle = np.stack(
+            [
+                _middle_of_hand(seen, frame, keypoint[view, frame, hand])
+                for view, seen in enumerate(known)
+            ]
+        )
+        for view in np.argsort(trust[:, hand]):
+            apart = np.linalg.norm(middle - middle[view], axis=1) > _APART
+            together = np.isfinite(middle[:, 0]) & ~apart
+            if trust[apart, hand].sum() > trust[together, hand].sum():
+                keypoint[view, frame, hand] = middle[view] = np.nan
+    for seen, kept in zip(known, keypoint, strict=True):
+        seen.keypoint = kept
+
+
+def _middle_of_hand(
+    seen: _Seen, frame: int, keypoint: Float[ndarray, "21 3"]
+) -> Float[ndarray, " 3"]:
+    """Find where depth puts a hand's keypoints, on the median [m]; NaN if it tells of few."""
+    height, width = seen.label.shape[1:]
+    column, row = np.nan_to_num(keypoint[:, :2], nan=-1.0).round().astype(np.int64).T
+    inside: ndarray = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+    if inside.sum() < _LEAST_JOINTS:
+        return np.full(3, np.nan)
+    depth = seen.view.depth(frame)[row[inside], column[inside]]
+    if (depth > 0).sum() < _LEAST_JOINTS:
+        return np.full(3, np.nan)
+    pixel = keypoint[inside, :2][depth > 0].astype(np.float64)
+    return np.median(seen.view.camera.unproject(pixel, depth[depth > 0]), axis=0)
 
 
 def _place_hands(sequence: Sequence, found: Many[_Seen]) -> None:

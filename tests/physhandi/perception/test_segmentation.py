@@ -75,6 +75,25 @@ def test_a_hand_that_one_view_does_not_detect_is_shown_to_it_by_the_other(tmp_pa
     assert agreement(found["side"], true["side"], 2).mean() > 0.7
 
 
+@pytest.mark.parametrize("unsure", ["side", "top"])
+def test_what_one_view_takes_for_a_hand_yields_to_a_view_that_is_surer(tmp_path, unsure):
+    sequence, true = write_disc(tmp_path / "held", hand=True)
+    path = sequence.folder / "views" / unsure / "keypoint.npy"
+    keypoint = np.load(path)
+    # On the table, 0.1 m and more from the hand; surer than the other view, but in few frames.
+    keypoint[:, :, :, 0] -= 55
+    keypoint[3:, :, :, 2], keypoint[:3, :, :, 2] = 0.5, 1.0
+    np.save(path, keypoint)
+    other = ({"side", "top"} - {unsure}).pop()
+    right = np.load(sequence.folder / "views" / other / "keypoint.npy")
+    right[..., 2] = 0.9
+    np.save(sequence.folder / "views" / other / "keypoint.npy", right)
+    found = segment(type(sequence).load(sequence.folder), [Click(*disc_click())])
+    for view, least in ((unsure, 0.7), (other, 0.8)):
+        assert agreement(found[view], true[view], 2).mean() > least
+        assert agreement(found[view], true[view], 1).mean() > 0.9
+
+
 def test_without_a_click_hands_alone_are_found(held_disc):
     sequence, true = held_disc
     for view, label in segment(sequence, []).items():
