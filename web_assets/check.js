@@ -190,7 +190,7 @@ function followAnnotation(job, was) {
   part("unfound").textContent = job.reason;
   const { stage, iteration, total } = job.progress;
   const bar = annotation.querySelector("progress");
-  if (total) [bar.max, bar.value] = [total, iteration];
+  [bar.max, bar.value] = total ? [total, iteration] : [1, 0]; // Or it would show the job before.
   part("found").textContent = stage ? `${stage.replaceAll("_", " ")} · ${iteration} of ${total}` : "starting …";
   if (isRunning) setTimeout(async () => followAnnotation(await send("GET", own()).catch(() => job), "running"), POLL_MS);
 }

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from accessibility import violations
 from clicked_disc import HEIGHT, TOP, WIDTH, cameras, center, write_disc
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 from raw_capture import RawCapture
 from scene_page import TIMEOUT_MS
 from sheet_sequence import write_sheet
@@ -213,6 +213,23 @@ def test_a_recording_is_checked_frame_by_frame(home: Page, base: str) -> None:
     )
     home.get_by_role("button", name="Launch fit").click()
     expect(home.locator("[data-readiness]")).to_contain_text("All stages will run.")
+
+
+def test_the_bar_of_a_new_search_begins_empty(home: Page, base: str, served) -> None:
+    write_disc(served.data_dir / "sequences/searched", masks=True, frames=2)
+    jobs = [{"stage": "point_tracking", "iteration": 180, "total": 180}, {}]
+
+    def answer(route: Route) -> None:
+        job = {"state": "running", "reason": "", "progress": jobs[0]}
+        route.fulfill(json=job)
+        del jobs[:-1]
+
+    home.route("**/api/v1/sequences/searched/annotation", answer)
+    home.goto(f"{base}/sequences/searched/check")
+    expect(home.locator("[data-found]")).to_have_text("starting …")
+    bar = home.locator("[data-finding] progress")
+    expect(bar).to_be_visible()
+    expect(bar).to_have_js_property("value", 0)
 
 
 def find_in_a_box(page: Page) -> dict[str, float | str]:
