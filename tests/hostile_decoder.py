@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from physhandi.child import run_child
-from physhandi.data import decoding
+from physhandi.data.untrusted import media
 
 
 def decode(request: dict[str, Any], videos: Any) -> Any:
@@ -23,8 +23,8 @@ def decode(request: dict[str, Any], videos: Any) -> Any:
     return ORIGINAL(request, videos)
 
 
-ORIGINAL = decoding.decode
+ORIGINAL = media.decode
 
 if __name__ == "__main__":
-    decoding.decode = decode
-    run_child(decoding.answer_requests)
+    media.decode = decode
+    run_child(media.answer_requests)

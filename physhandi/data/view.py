@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import read_array
-from physhandi.data.image_header import announced_size, check_pixels, video_size
+from physhandi.data.untrusted.image_header import announced_size, check_pixels, video_size
 from physhandi.errors import SequenceError
 
 _CACHED_FRAMES = 16

@@ -11,7 +11,6 @@ from typing import Any
 from app.jobs.recordings.ordered import work_on_order
 from app.jobs.recordings.upload_names import MOST_FILES, check_names, is_left_out, quoted_name
 from physhandi.data.files import sync_folder, write_yaml
-from physhandi.data.foreign import limit_data
 from physhandi.data.importers.bag import BAG_SUFFIXES
 from physhandi.data.run_folder import (
     ATTEMPTS,
@@ -32,6 +31,7 @@ from physhandi.data.run_folder import (
 )
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
+from physhandi.data.untrusted.pickles import limit_data
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
 from physhandi.run import Run

@@ -17,11 +17,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.child import Channel, Child, ChildEndedError, run_child
-from physhandi.data.foreign import limit_data
-from physhandi.data.image_header import MOST_PIXELS
 from physhandi.data.importers.phystwin_files import fail
 from physhandi.data.importers.record3d import RECORD3D_SUFFIX, unpack_record3d
 from physhandi.data.importers.recorded_view import CALIBRATION
+from physhandi.data.untrusted.image_header import MOST_PIXELS
+from physhandi.data.untrusted.pickles import limit_data
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.files import named_fields, write_atomically
-from physhandi.data.foreign import read_untrusted
+from physhandi.data.untrusted.pickles import read_untrusted
 from physhandi.errors import ImportFailedError
 
 MANO_FORMAT = "physhandi-mano-1"

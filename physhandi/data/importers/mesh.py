@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from physhandi.data.image_header import MOST_PIXELS
+from physhandi.data.untrusted.image_header import MOST_PIXELS
 from physhandi.errors import UsageError
 
 KINDS = (".glb", ".gltf", ".ply", ".obj", ".stl")

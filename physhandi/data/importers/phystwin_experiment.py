@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.foreign import read_untrusted
 from physhandi.data.importers.phystwin_files import fail, named, numbers
+from physhandi.data.untrusted.pickles import read_untrusted
 
 
 @dataclass(frozen=True, kw_only=True)

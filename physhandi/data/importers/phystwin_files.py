@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.decoding import media_decoder
 from physhandi.data.files import read_array
-from physhandi.data.foreign import read_untrusted
-from physhandi.data.image_header import announced_size, video_size
 from physhandi.data.length_unit import FARTHEST_POSITION as FARTHEST
 from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.data.untrusted.image_header import announced_size, video_size
+from physhandi.data.untrusted.media import media_decoder
+from physhandi.data.untrusted.pickles import read_untrusted
 from physhandi.errors import ImportFailedError
 
 _UNIT = "That looks like millimetres. Convert it to metres"

@@ -18,8 +18,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.files import named_fields
-from physhandi.data.image_header import MOST_PIXELS
 from physhandi.data.importers.phystwin_files import fail
+from physhandi.data.untrusted.image_header import MOST_PIXELS
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
 

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.decoding import media_decoder
 from physhandi.data.files import read_array
-from physhandi.data.image_header import MOST_PIXELS, announced_size
 from physhandi.data.importers.phystwin_files import fail, probe_video
 from physhandi.data.importers.recorded_camera import read_table
+from physhandi.data.untrusted.image_header import MOST_PIXELS, announced_size
+from physhandi.data.untrusted.media import media_decoder
 from physhandi.errors import ImportFailedError
 
 StreamKind = Literal["color", "depth"]

@@ -17,11 +17,11 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from physhandi.data.files import named_fields
-from physhandi.data.image_header import announced_size
 from physhandi.data.sequence import ARRAYS, Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.truth import read_truth
+from physhandi.data.untrusted.image_header import announced_size
 from physhandi.errors import MissingInputError
 from physhandi.synthetic.code_version import INPUTS, code_version
 

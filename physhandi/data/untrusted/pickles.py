@@ -635,7 +635,7 @@ def _work(channel: Channel) -> None:
 
 logger = logging.getLogger(__name__)
 
-_WORKER = "physhandi.data.foreign"
+_WORKER = "physhandi.data.untrusted.pickles"
 _ADVICE = (
     "Only numbers, text, containers, NumPy arrays, sparse matrices, chumpy arrays and tensors of "
     "a torch checkpoint are read. Nothing of the file was executed; use the file as its publisher "

@@ -16,7 +16,7 @@ from foreign_pickle import chumpy_select, python2_pickle
 from hostile_pickles import BROKEN, EXPLODING, canaries
 from waiting import LIMIT_S
 
-from physhandi.data.foreign import array_from_bytes, convert
+from physhandi.data.untrusted.pickles import array_from_bytes, convert
 from physhandi.errors import ImportFailedError
 
 MOST = 1 << 30
@@ -103,7 +103,7 @@ def test_arrays_may_take_a_quarter_of_the_memory() -> None:
 FORBIDDEN = """
 import os, sys
 from pathlib import Path
-from physhandi.data.foreign import forbid_calls
+from physhandi.data.untrusted.pickles import forbid_calls
 from physhandi.errors import ImportFailedError
 
 canary = Path(sys.argv[1])
@@ -127,7 +127,7 @@ def test_nothing_can_be_opened_or_started_while_a_file_is_read(tmp_path: Path) -
     # that begins to be traced, as coverage has it, any other thread that begins dies at once.
     done = subprocess.run(
         [sys.executable, "-c", FORBIDDEN, str(canary)],
-        cwd=Path(__file__).parents[3],
+        cwd=Path(__file__).parents[4],
         capture_output=True,
         text=True,
         timeout=LIMIT_S,

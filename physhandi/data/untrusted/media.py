@@ -19,11 +19,11 @@ import numpy as np
 from numpy import ndarray
 
 from physhandi.child import Channel, Child, ChildEndedError, run_child
-from physhandi.data.foreign import limit
-from physhandi.data.image_header import MOST_PIXELS
+from physhandi.data.untrusted.image_header import MOST_PIXELS
+from physhandi.data.untrusted.pickles import limit
 from physhandi.errors import ImportFailedError
 
-_WORKER = "physhandi.data.decoding"
+_WORKER = "physhandi.data.untrusted.media"
 _MEMORY = 3 << 30
 """Most address space of the process, that of its libraries included [byte]."""
 _ROOM = 8 * MOST_PIXELS

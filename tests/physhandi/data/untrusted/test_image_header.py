@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from physhandi.data.image_header import announced_size
+from physhandi.data.untrusted.image_header import announced_size
 
 
 def png(width: int, height: int) -> bytes:

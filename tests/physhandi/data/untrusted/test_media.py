@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from waiting import LIMIT_S
 
-from physhandi.data.decoding import MediaDecoder, media_decoder
+from physhandi.data.untrusted.media import MediaDecoder, media_decoder
 from physhandi.errors import ImportFailedError
 
 

@@ -13,7 +13,7 @@ import torch
 from foreign_pickle import chumpy_array, chumpy_select, python2_pickle
 from hostile_pickles import BROKEN, EXPLODING, Hostile, canaries
 
-from physhandi.data.foreign import read_untrusted
+from physhandi.data.untrusted.pickles import read_untrusted
 from physhandi.errors import ImportFailedError
 
 ARRAYS = {
