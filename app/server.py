@@ -24,6 +24,7 @@ from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
 from app.exports.shares import Shares
+from app.graceful_server import GracefulServer
 from app.health import RequestFigures, create_health
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.engines.device_choice import DeviceChoice
@@ -361,7 +362,7 @@ def _listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-class _Server(uvicorn.Server):
+class _Server(GracefulServer):
     """Tells when the first request can be answered, and ends event streams when it stops."""
 
     def __init__(

@@ -13,6 +13,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from waiting import LIMIT_S, until
 
+from app.graceful_server import GracefulServer
 from app.jobs.catalog import Catalog
 from app.jobs.processes import end_processes
 from app.jobs.scheduler import Scheduler
@@ -135,7 +136,7 @@ def serving(world: QueueWorld) -> Iterator[int]:
     config = uvicorn.Config(
         world.app, port=0, lifespan="off", log_level="error", timeout_graceful_shutdown=60
     )
-    server = uvicorn.Server(config)
+    server = GracefulServer(config)
     thread = Thread(target=server.run, daemon=True)
     thread.start()
     until(lambda: server.started)

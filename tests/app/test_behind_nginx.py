@@ -23,6 +23,7 @@ from waiting import LIMIT_S, until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from app.graceful_server import GracefulServer
 from app.security import Security
 from app.server import create_app
 from app.slow_requests import ImpatientProtocol
@@ -92,7 +93,7 @@ def proxy(world: World, tmp_path: Path, request: pytest.FixtureRequest) -> Itera
     config = uvicorn.Config(
         app, port=0, http=ImpatientProtocol, lifespan="off", log_level="error", ws_max_size=2**26
     )
-    server = uvicorn.Server(config)
+    server = GracefulServer(config)
     thread = threading.Thread(target=server.run)
     thread.start()
     until(lambda: server.started)

@@ -20,6 +20,7 @@ from uvicorn.server import ServerState
 from waiting import LIMIT_S, until
 from websockets.sync.client import connect
 
+from app.graceful_server import GracefulServer
 from app.slow_requests import ImpatientProtocol
 
 HEAD = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n"
@@ -167,7 +168,7 @@ class Hasty(ImpatientProtocol):
 def serving(listener: socket.socket, *routes: BaseRoute) -> Iterator[None]:
     """Serve what has connected to a socket, and what does."""
     app = Starlette(routes=routes)
-    server = uvicorn.Server(uvicorn.Config(app, http=Hasty, log_level="critical"))
+    server = GracefulServer(uvicorn.Config(app, http=Hasty, log_level="critical"))
     thread = threading.Thread(target=server.run, args=([listener],))
     thread.start()
     until(lambda: server.started)

@@ -22,6 +22,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from app.graceful_server import GracefulServer
 from app.settings import WEB_ASSETS
 from app.viewer.content.session_state import SessionState
 from app.viewer.edit.selection import DrawnShape
@@ -42,7 +43,7 @@ def address(sessions: Sessions) -> Iterator[str]:
     config = uvicorn.Config(
         named, host="127.0.0.1", port=0, log_level="warning", ws_per_message_deflate=False
     )
-    server = uvicorn.Server(config)
+    server = GracefulServer(config)
     thread = threading.Thread(target=server.run)
     thread.start()
     until(lambda: server.started)
