@@ -6,10 +6,12 @@ import sys
 import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
+from functools import cache
 
 from physhandi.errors import UsageError
 
 
+@cache
 def start_warp() -> None:
     """Start Warp, once a process, without its greeting.
 
@@ -26,6 +28,7 @@ def start_warp() -> None:
         wp.init()
 
 
+@cache
 def has_cuda_driver() -> bool:
     """Tell whether NVIDIA's driver is installed."""
     try:

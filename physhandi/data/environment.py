@@ -2,6 +2,7 @@
 
 import os
 import platform
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,6 @@ def describe_environment(device: str, device_name: str = "") -> dict[str, Any]:
         ``python``, ``packages`` (name and version of those installed) and ``commit`` of the
         checkout; none outside of one.
     """
-    packages: dict[str, str] = {}
-    for name in _PACKAGES:
-        try:
-            packages[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return {
         "started": now(),
         "device": device,
@@ -38,11 +33,24 @@ def describe_environment(device: str, device_name: str = "") -> dict[str, Any]:
         "cpu_count": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "packages": packages,
+        "packages": dict(_installed()),
         "commit": commit_of(_SOURCE),
     }
 
 
+@cache
+def _installed() -> dict[str, str]:
+    """Versions of the packages that figures depend on, as they were when this process began."""
+    versions: dict[str, str] = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+@cache
 def processor_name() -> str:
     """Give what the processor calls itself; empty if it does not tell."""
     try:

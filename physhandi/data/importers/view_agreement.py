@@ -66,16 +66,19 @@ def find_table(
     random = np.random.default_rng(0)
     thickness = np.maximum(_THICKNESS, _RELATIVE * np.linalg.norm(point - eye.mean(0), axis=1))
     best: Bool[ndarray, " point"] = np.zeros(len(point), bool)
+    most = 0
     for _ in range(_ROUNDS):
         a, b, c = point[random.choice(len(point), 3, replace=False)]
         across = np.cross(b - a, c - a)
         length = float(np.linalg.norm(across))
         if length < 1e-6:
             continue
-        is_on = np.abs((point - a) @ (across / length)) < thickness
-        if is_on.sum() > best.sum():
-            best = is_on
-    if best.sum() < 100:
+        normal = across / length
+        is_on = np.abs(point @ normal - a @ normal) < thickness
+        count = np.count_nonzero(is_on)
+        if count > most:
+            best, most = is_on, count
+    if most < 100:
         return None
     center, normal = _plane(point[best])
     for _ in range(2):
