@@ -28,7 +28,6 @@ def start_warp() -> None:
         wp.init()
 
 
-@cache
 def has_cuda_driver() -> bool:
     """Tell whether NVIDIA's driver is installed."""
     try:

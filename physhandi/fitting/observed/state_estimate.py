@@ -25,10 +25,12 @@ VELOCITY_FRAMES = 3
 """Last frames over which the velocity is averaged. Over two of them the noise of tracks would be
 twice as large; the more there are, the farther it lags behind a motion that changes."""
 
-TRACK_WIDTH = 0.75
-"""Standard deviation of the Gaussian by which tracks around a node are weighted [distances of
-nodes]. What is left of their noise becomes a part of the rest lengths, as if the object were
-crumpled; the wider it is, the more bends are smoothed away."""
+TRACK_WIDTH = 0.375
+"""Least standard deviation of the Gaussian by which tracks around a node are weighted [least
+distance between two nodes]. What is left of their noise becomes a part of the rest lengths, as if
+the object were crumpled; the wider it is, the more bends are smoothed away."""
+_HIDDEN = 0.5
+"""Distance from the nearest track beyond which none shows a node [least distance between two]."""
 MOST_TRACKS_AROUND = 60
 """Most tracks whose mean a node takes, the nearest."""
 
@@ -94,11 +96,11 @@ def _seen(
         return own + last_residual(start, own, *seen, observation.node_of_track)
     place, residual = track_residuals(start, own, *seen)
     nodes: Any = KDTree(start)
-    spacing = float(np.median(nodes.query(start, k=min(2, len(start)))[0]))
+    spacing = float(nodes.query(start, k=[min(2, len(start))])[0].min())
     acts = model.acts_in(frame)[model.object_spring_count :]
     held = np.unique(model.spring_nodes[model.object_spring_count :][acts].min(axis=1))
     shown: Any = KDTree(place)
-    hidden = start[held[shown.query(start[held])[0] > spacing]]
+    hidden = start[held[shown.query(start[held])[0] > _HIDDEN * spacing]]
     place = np.concatenate([place, hidden])
     residual = np.concatenate([residual, np.zeros_like(hidden)])
     return own + _smoothed(start, place, residual, TRACK_WIDTH * spacing)

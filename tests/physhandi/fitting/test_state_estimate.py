@@ -139,7 +139,7 @@ def moved_sheet(residual: np.ndarray, hidden: np.ndarray, *, is_held: bool = Fal
 def gaussian_mean(node: np.ndarray, place: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Weigh one value after the other by exp(-d^2 / 2 w^2)."""
     distance = [float(np.sqrt(((node - at) ** 2).sum())) for at in place]
-    width = max(0.75 * 0.01, sorted(distance)[7] / 2)
+    width = max(0.375 * 0.01, sorted(distance)[7] / 2)
     weight = [np.exp(-0.5 * (far / width) ** 2) for far in distance]
     return sum(w * v for w, v in zip(weight, value, strict=True)) / sum(weight)
 
@@ -168,6 +168,6 @@ def test_what_a_hand_hides_is_where_the_rollout_has_it() -> None:
     np.testing.assert_allclose(held, SHEET + expected, atol=2e-6)
     moved = np.linalg.norm(held - SHEET, axis=1)
     assert moved[HELD] < 0.8 * np.linalg.norm(residual[0]) < 0.999 * moved.max()
-    # A track within a node distance shows it; then the hand says nothing.
+    # A track that near shows it; then the hand says nothing.
     shown = moved_sheet(residual, far < 0.001, is_held=True)
     np.testing.assert_allclose(shown, SHEET + residual, atol=2e-6)
