@@ -43,10 +43,11 @@
       sign.hidden = !state.steering;
       /* The hint of a first visit would lie over the sign. */
       document.body.toggleAttribute("data-steering", Boolean(state.steering));
-      const fingers = state.curls ? ", R F close and open its fingers" : "";
+      const [it, its] = state.both ? ["them", "their"] : ["it", "its"];
+      const fingers = state.curls ? `, R F close and open ${its} fingers` : "";
       const tip = state.finger ? `its arrows bend the ${state.finger}, ` : state.curls ? "a click on a fingertip bends that finger, " : "";
-      const own = state.turns ? `, I K J L U O turn it${fingers}, X lets go and grips` : ", X lets go of it";
-      sign.textContent = state.steering ? `Steering ${state.what}: W S A D Q E move it${own}, ${tip}a click on the object holds a point to pull, space records, ctrl Z takes back, G ends` : "";
+      const own = state.turns ? `, I K J L U O turn ${it}${fingers}, X lets go and grips` : ", X lets go of it";
+      sign.textContent = state.steering ? `Steering ${state.what}: W S A D Q E move ${it}${own}, ${tip}a click on the object holds a point to pull, space records, ctrl Z takes back, G ends` : "";
       if (state.recording) sign.textContent = `● Recording. ${sign.textContent}`;
       sign.dataset.recording = state.recording ? "yes" : "";
     }

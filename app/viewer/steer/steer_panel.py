@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
@@ -46,8 +46,9 @@ GIZMO = "/steer/wrist"
 """Path in the scene of the gizmo on the wrist, a fingertip or a point that is held."""
 _START, _STOP = "Steer (G)", "Back to playback (G)"
 _RECORD, _END_RECORDING = "Record (space)", "End recording (space)"
-_PLAY, _DISCARD = "Play", "Discard"
+_PLAY, _DISCARD = "Play take", "Discard"
 _LET_GO, _GRIP = "Let go (X)", "Grip (X)"
+_SIDES, _BOTH = frozenset({"right", "left"}), "both hands"
 _POINT_COLOR = (233, 30, 180)
 _RED = (166, 30, 30)
 """Color of what records; white on it can be read (contrast of 7)."""
@@ -79,8 +80,8 @@ _HOW = (
     "arrows and rings on its wrist, or by keys that you hold. <b>W S A D Q E</b> move it as you "
     "see it, <b>I K J L U O</b> turn it, <b>R F</b> close and open its fingers; click the dot on a "
     "fingertip to bend that finger alone. <b>X</b> lets go of the object, and grips what is near. "
-    "Click a point of the object to hold it there and pull. "
-    "Ctrl Z takes back."
+    "Click a point of the object to hold it there and pull. Of two hands, <b>Move</b> takes one "
+    "or both. Ctrl Z takes back."
 )
 
 
@@ -117,19 +118,29 @@ Shown = tuple[ObjectRollout, int, Mapping[str, Float[ndarray, "vertex 3"]]]
 
 @dataclass(frozen=True)
 class Moved:
-    """What keys and the gizmo move: a hand, or one finger of it by its tip."""
+    """What keys and the gizmo move: a hand, both, or one finger by its tip."""
 
-    hand: int
-    """Number of the hand, or of a point that is held."""
+    hands: tuple[int, ...]
+    """Numbers of the hands, or that of a point that is held."""
     finger: int | None = None
-    """Number of the finger; None for the whole hand."""
+    """Number of the finger; None for whole hands."""
 
-    def place(self, hand: SteeredHand, pose: Float[ndarray, " pose"]) -> Float[ndarray, " 3"]:
-        """Tell where its gizmo is [m]."""
-        return hand.wrist + pose[:3] if self.finger is None else hand.tip(self.finger, pose)
+    def place(
+        self, hands: Sequence[SteeredHand], pose: Float[ndarray, "hand pose"]
+    ) -> Float[ndarray, " 3"]:
+        """Tell where its gizmo is [m]: on the wrist, the tip, or halfway between two wrists."""
+        if self.finger is not None:
+            (hand,) = self.hands
+            return hands[hand].tip(self.finger, pose[hand])
+        return np.mean([hands[hand].wrist + pose[hand, :3] for hand in self.hands], axis=0)
 
-    def dot(self, hand: SteeredHand, pose: Float[ndarray, " pose"]) -> Float[ndarray, " 3"] | None:
-        """Tell where the dot is by which it is chosen [m]; None for what has no fingers."""
+    def dot(
+        self, hands: Sequence[SteeredHand], pose: Float[ndarray, "hand pose"]
+    ) -> Float[ndarray, " 3"] | None:
+        """Tell where the dot is by which it is chosen [m]; None for both, or without fingers."""
+        return None if len(self.hands) > 1 else self._dot(hands[self.hands[0]], pose[self.hands[0]])
+
+    def _dot(self, hand: SteeredHand, pose: Float[ndarray, " pose"]) -> Float[ndarray, " 3"] | None:
         if hand.fingers is None:
             return None
         fingers, size = hand.fingers, _length(hand)
@@ -198,7 +209,8 @@ class SteerPanel:
         self._take_folder: TakeFolder | None = None
         self._lock = threading.RLock()
         self._object: SteeredObject | None = None
-        self._moved = Moved(0)
+        self._moved = Moved((0,))
+        self._apart: dict[int, Float[ndarray, " pose"]] = {}
         self._dots: dict[Moved, Float[ndarray, " 3"]] = {}
         self._frame = 0
         self._was_playing = False
@@ -467,7 +479,7 @@ class SteerPanel:
                 lambda take, state, pose: take.hold_point(node, state, pose, _unused_name(take))
             )
             self._offer(take)
-            self._select(Moved(len(take.hands) - 1))
+            self._select(Moved((len(take.hands) - 1,)))
 
     @property
     def dots(self) -> Float[ndarray, "dot 3"]:
@@ -482,23 +494,25 @@ class SteerPanel:
                 self._select(tuple(self._dots)[number])
 
     def _toggle_grip(self) -> None:
-        """Let the chosen hand go, or grip what is near; a point is held no more."""
+        """Let the chosen hands go, or grip what is near; a point is held no more."""
         with self._lock:
             steered = self._object
             if steered is None or steered.is_replaying:
                 return
-            hand = self._moved.hand
-            is_point = self._is_point(steered.take, hand)
+            hands = self._moved.hands
+            is_point = self._is_point(steered.take, hands[0])
 
             def change(take: Take, state: NodeState, pose: Float[ndarray, "hand pose"]) -> Take:
                 if is_point:
-                    return take.without_point(hand, state, pose)
-                if take.holds(hand):
-                    return take.let_go(hand, state, pose)
-                gripping = take.grip(hand, state, pose)
-                if not gripping.holds(hand):
+                    return take.without_point(hands[0], state, pose)
+                holding = [hand for hand in hands if take.holds(hand)]
+                for hand in holding or hands:
+                    let_go_or_grip = take.let_go if holding else take.grip
+                    take = let_go_or_grip(hand, state, pose)
+                    pose = take.pose[0]
+                if not holding and not any(take.holds(hand) for hand in hands):
                     raise UsageError("Nothing of the object is near the hand. Move it nearer.")
-                return gripping
+                return take
 
             self._end_recording(steered)
             try:
@@ -506,7 +520,7 @@ class SteerPanel:
             except UsageError as error:
                 notify(self._server, "Nothing to grip", str(error), seconds=4.0)
             if is_point:
-                self._select(Moved(0))
+                self._select(Moved((0,)))
             self._write(at_once=True)
 
     def _is_point(self, take: Take, hand: int) -> bool:
@@ -514,7 +528,7 @@ class SteerPanel:
         return hand >= max(len(self._content.hands), 1) and hand < len(take.hands)
 
     def _what(self, take: Take, hand: int) -> str:
-        """Say within a sentence what is moved."""
+        """Name a hand or a point within a sentence."""
         title = _title(take.hands[hand])
         return title if self._is_point(take, hand) else f"the {title}"
 
@@ -529,7 +543,9 @@ class SteerPanel:
             self._choice.visible = len(names) > 1
             last = len(take.hands) - 1
             self._select(
-                self._moved if self._moved in names.values() else Moved(min(self._moved.hand, last))
+                self._moved
+                if self._moved in names.values()
+                else Moved((min(self._moved.hands[0], last),))
             )
 
     def _select(self, moved: Moved) -> None:
@@ -539,7 +555,7 @@ class SteerPanel:
             return
         self._moved = moved
         for other in range(len(take.hands)):
-            if other != moved.hand:
+            if other not in moved.hands:
                 steered.order(other, HandOrder())
         self._remove_gizmo()
         self._add_gizmo(take, steered.newest.pose)
@@ -556,16 +572,17 @@ class SteerPanel:
         self._gizmo, self._is_dragged, self._was_dragged = None, False, False
 
     def _add_gizmo(self, take: Take, pose: Float[ndarray, "hand pose"]) -> None:
-        number, finger = self._moved.hand, self._moved.finger
-        hand = take.hands[number]
+        hands, finger = self._moved.hands, self._moved.finger
         gizmo = self._gizmo = self._server.scene.add_transform_controls(
             GIZMO,
             scale=(
-                _GIZMO_SIZE * self._extent if finger is None else _TIP_GIZMO_SIZE * _length(hand)
+                _GIZMO_SIZE * self._extent
+                if finger is None
+                else _TIP_GIZMO_SIZE * _length(take.hands[hands[0]])
             ),
-            disable_rotations=finger is not None or self._is_point(take, number),
+            disable_rotations=not self._turns(take),
             depth_test=False,
-            position=self._moved.place(hand, pose[number]),
+            position=self._moved.place(take.hands, pose),
         )
 
         # In the order in which the browser has sent them, which threads would not keep.
@@ -574,8 +591,13 @@ class SteerPanel:
 
         gizmo.on_update(moved)
 
+    def _turns(self, take: Take) -> bool:
+        """Whether the gizmo turns what it moves: two hands have no common wrist."""
+        hands = self._moved.hands
+        return self._moved.finger is None and len(hands) == 1 and not self._is_point(take, hands[0])
+
     def _drag(self, event: viser.TransformControlsEvent) -> None:
-        """Let the hand follow the gizmo."""
+        """Let hands follow the gizmo; two of them keep their places beside it."""
         with self._lock:
             steered = self._object
             if steered is None or event.target is not self._gizmo or steered.is_replaying:
@@ -583,28 +605,58 @@ class SteerPanel:
             if event.phase == "start":
                 self._is_dragged, self._refused = True, ""
                 steered.begin_gesture()
+                self._keep_apart(steered.newest)
                 return
             if event.phase == "end":
                 self._is_dragged, self._was_dragged = False, True
-            number, finger = self._moved.hand, self._moved.finger
             newest = steered.newest
-            if number >= len(newest.take.hands):
+            if max(self._moved.hands) >= len(newest.take.hands):
                 return
-            hand, told = newest.take.hands[number], steered.order_of(number)
             try:
-                if finger is None:
-                    goal = _goal(hand, event.target.position, event.target.wxyz)
-                    steered.order(number, HandOrder(goal=goal, bend=told.bend))
-                    return
-                pose = newest.pose[number].copy()
-                if told.bend is not None:
-                    pose[7:] = told.bend
-                bend = hand.follow(finger, event.target.position, pose)
-                steered.order(number, replace(told, bend=tuple(float(angle) for angle in bend)))
+                if self._moved.finger is None:
+                    self._drag_hands(steered, newest, event.target)
+                else:
+                    self._drag_finger(steered, newest, self._moved.finger, event.target.position)
             except PhysHandiError as error:
                 if str(error) != self._refused:
                     self._refused = str(error)
                     notify(event.client, "Not possible", self._refused)
+
+    def _drag_hands(
+        self, steered: SteeredObject, newest: SteeredFrame, gizmo: viser.TransformControlsHandle
+    ) -> None:
+        for number in self._moved.hands:
+            place, turn = np.asarray(gizmo.position, np.float64), np.asarray(gizmo.wxyz)
+            apart = self._apart.get(number)
+            if apart is not None:
+                place, turn = place + apart[:3], to_quaternion(apart[3:6])
+            goal = _goal(newest.take.hands[number], place, turn)
+            steered.order(number, HandOrder(goal=goal, bend=steered.order_of(number).bend))
+
+    def _drag_finger(
+        self,
+        steered: SteeredObject,
+        newest: SteeredFrame,
+        finger: int,
+        place: Float[ndarray, " 3"],
+    ) -> None:
+        (number,) = self._moved.hands
+        told, pose = steered.order_of(number), newest.pose[number].copy()
+        if told.bend is not None:
+            pose[7:] = told.bend
+        bend = newest.take.hands[number].follow(finger, place, pose)
+        steered.order(number, replace(told, bend=tuple(float(angle) for angle in bend)))
+
+    def _keep_apart(self, frame: SteeredFrame) -> None:
+        """Remember how two hands are turned, and where they are beside their gizmo [m]."""
+        self._apart = {}
+        if len(self._moved.hands) == 1:
+            return
+        middle = self._moved.place(frame.take.hands, frame.pose)
+        for number in self._moved.hands:
+            pose = frame.pose[number].copy()
+            pose[:3] += frame.take.hands[number].wrist - middle
+            self._apart[number] = pose
 
     def _follow(self, frame: SteeredFrame) -> None:
         """Put the gizmo where the hand is, unless it is being dragged, and draw dots to click."""
@@ -624,8 +676,7 @@ class SteerPanel:
         self._dots = {
             moved: place
             for moved in _choices(frame.take).values()
-            if moved != self._moved
-            and (place := moved.dot(hands[moved.hand], frame.pose[moved.hand])) is not None
+            if moved != self._moved and (place := moved.dot(hands, frame.pose)) is not None
         }
         self._nodes.spheres(
             "/steer/dots",
@@ -637,9 +688,9 @@ class SteerPanel:
         gizmo = self._gizmo
         if gizmo is None or self._is_dragged:
             return
-        pose = frame.pose[self._moved.hand]
-        position = self._moved.place(hands[self._moved.hand], pose)
-        wxyz = to_quaternion(pose[3:6] if self._moved.finger is None else np.zeros(3))
+        turns, number = self._turns(frame.take), self._moved.hands[0]
+        position = self._moved.place(hands, frame.pose)
+        wxyz = to_quaternion(frame.pose[number, 3:6] if turns else np.zeros(3))
         if self._was_dragged:
             # Where the hand was before may have come after the last of the drag, and the browser
             # shows that; viser sends nothing that it believes to be there.
@@ -673,9 +724,9 @@ class SteerPanel:
         turn_speed = math.radians(self._turn_speed.value)
         velocity = velocity_of(self._held, self._axes(), self._speed.value, turn_speed)
         closing = _CLOSING * (("KeyR" in self._held) - ("KeyF" in self._held))
-        hand = self._moved.hand
-        bend = steered.order_of(hand).bend
-        steered.order(hand, HandOrder(velocity=velocity, closing=closing, bend=bend))
+        for hand in self._moved.hands:
+            bend = steered.order_of(hand).bend
+            steered.order(hand, HandOrder(velocity=velocity, closing=closing, bend=bend))
 
     def _weight(self) -> float:
         """Tell what the object weighs, as forces are shown [N]."""
@@ -724,8 +775,10 @@ class SteerPanel:
         """Tell the page whether keys steer."""
         state: dict[str, Any] = {"steering": self.is_on}
         if self.is_on and self._take is not None:
-            number, finger = self._moved.hand, self._moved.finger
-            state["what"] = self._what(self._take, number)
+            hands, finger = self._moved.hands, self._moved.finger
+            number = hands[0]
+            state["what"] = _BOTH if len(hands) > 1 else self._what(self._take, number)
+            state["both"] = len(hands) > 1
             state["turns"] = not self._is_point(self._take, number)
             state["curls"] = self._take.hands[number].curls is not None
             state["finger"] = "" if finger is None else FINGERS[finger]
@@ -758,16 +811,19 @@ class SteerPanel:
 
     def _pull(self, frame: SteeredFrame) -> str:
         """Say how hard the object pulls at what is moved."""
-        hand = self._moved.hand
-        if frame.pull is None or hand >= len(frame.pull):
+        hands = self._moved.hands
+        if frame.pull is None or max(hands) >= len(frame.pull):
             return ""
-        force = self._newtons() * float(np.linalg.norm(frame.pull[hand]))
-        return f"<br>the object pulls at {self._what(frame.take, hand)} with {force:.2g} N"
+        force = self._newtons() * np.linalg.norm(frame.pull, axis=-1)
+        return "".join(
+            f"<br>the object pulls at {self._what(frame.take, hand)} with {force[hand]:.2g} N"
+            for hand in hands
+        )
 
     def _show_buttons(self, steered: SteeredObject | None) -> None:
         """Say on the buttons what they would do now; those that do nothing are hidden."""
         is_on, take = steered is not None, self._take
-        holds = take is not None and take.holds(self._moved.hand)
+        holds = take is not None and any(take.holds(hand) for hand in self._moved.hands)
         is_recording = steered is not None and steered.is_recording
         for button, is_visible, label in (
             (self._button, True, _STOP if is_on else _START),
@@ -862,18 +918,20 @@ class TakeFolder:
 
 def _choices(take: Take) -> dict[str, Moved]:
     """Name all that can be moved."""
-    names: dict[str, Moved] = {}
+    names = {_title(hand): Moved((number,)) for number, hand in enumerate(take.hands)}
+    both = tuple(number for number, hand in enumerate(take.hands) if hand.name in _SIDES)
+    if len(both) > 1:
+        names[_BOTH] = Moved(both)
     for number, hand in enumerate(take.hands):
-        names[_title(hand)] = Moved(number)
         if hand.fingers is not None:
             for finger, name in enumerate(FINGERS):
-                names[f"{hand.name} {name}"] = Moved(number, finger)
+                names[f"{hand.name} {name}"] = Moved((number,), finger)
     return names
 
 
 def _title(hand: SteeredHand) -> str:
     """Name what is moved for people."""
-    return f"{hand.name} hand" if hand.name in {"right", "left"} else hand.name
+    return f"{hand.name} hand" if hand.name in _SIDES else hand.name
 
 
 def _dot_width(take: Take) -> float:

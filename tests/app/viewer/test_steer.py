@@ -76,6 +76,7 @@ def test_a_held_key_moves_hand_gizmo_and_object_until_it_is_let_go(scene, run) -
     says = {
         "steering": True,
         "what": "the controls",
+        "both": False,
         "turns": True,
         "curls": False,
         "finger": "",
@@ -168,7 +169,7 @@ def test_a_recording_is_trimmed_and_played_whenever_that_is_wanted(scene) -> Non
     last = len(recorded.frames) - 1
 
     def plays() -> None:
-        client.set("Take", "Play")
+        client.set("Take", "Play take")
         wait(client, lambda: session._steer.is_on and session._steer._object.is_replaying)
         wait(client, lambda: not session._steer._object.is_replaying)
         # The hand is steered on from where the take has brought it.
@@ -467,7 +468,35 @@ def two_hands(tmp_path: Path) -> Iterator[Session]:
     sessions.shutdown()
 
 
-def test_a_finger_of_the_other_hand_is_chosen_by_its_dot_and_moves_alone(
+def move_both(session: Session, client: ViewerClient) -> None:
+    """Let go with two hands, take that back, and record how they are dragged and lifted by keys."""
+    object_ = session._steer._object
+    client.set("Move", "both hands")
+    wait(client, lambda: session._steer._status.content.count("pulls at the") == 2)
+    press(session, "grip")
+    wait(client, lambda: not object_.take.holds(0) and client.find("Grip (X)"))
+    press(session, "undo")
+    wait(client, lambda: object_.take.holds(0) and client.find("Let go (X)"))
+    before, hands = object_.newest.pose, object_.take.hands
+    middle = np.mean([hand.wrist for hand in hands], axis=0)
+    wait(client, lambda: np.allclose(client.positions[GIZMO], middle, atol=1e-6))
+    press(session, "record")
+    wait(client, lambda: object_.is_recording)
+    moved = before.copy()
+    moved[:, :3] += [0.0, 0.01, 0.02]
+    drag(client, middle + np.array([0.0, 0.01, 0.02]))
+    wait(client, lambda: np.allclose(object_.newest.pose, moved, atol=1e-5))
+    hold(session, "KeyE")
+    wait(client, lambda: object_.newest.pose[:, 2].min() > 0.03)
+    hold(session)
+    press(session, "record")
+    wait(client, lambda: client.find("Keep"))
+    controls = session._steer._recorded.take.controls()
+    for hand in hands:
+        assert (controls[-1, hand.control, 2] - controls[0, hand.control, 2]).min() > 0.029
+
+
+def test_the_other_hand_s_finger_moves_alone_and_both_hands_move_at_once(
     two_hands: Session,
 ) -> None:
     session = two_hands
@@ -509,3 +538,4 @@ def test_a_finger_of_the_other_hand_is_chosen_by_its_dot_and_moves_alone(
         wait(
             client, lambda: np.allclose(client.array(HAND, "vertices"), right.vertex[AT], atol=1e-5)
         )
+        move_both(session, client)
