@@ -3,11 +3,12 @@
 /* Part of viser's page wherever we show it, live, as a replay or in a file: what it lacks for our scenes.
 
    Meshes of viser have one color. Where more bytes follow that, they are the colors of the vertices.
-   Until the first frame is drawn, the page is covered: its parts come one by one. Below that cover viser
+   Until the first frame is drawn and lit, the page is covered: its parts come one by one. Below that cover viser
    fades its canvas in, in five frames, and stops halfway, for good, where our light arrives meanwhile. */
 
 {
   const LONGEST_MS = 10000;
+  const UNLIT_MS = 3000;
   const LEAST_ASPECT = 1;
   const SHOWN = ["MeshMessage", "PointCloudMessage", "LineSegmentsMessage", "CameraFrustumMessage", "BatchedMeshesMessage", "GaussianSplatsMessage"];
   const LINEAR = Float32Array.from({ length: 256 }, (_, value) => (value < 10.32 ? value / 3294.6 : ((value / 255 + 0.055) / 1.055) ** 2.4));
@@ -92,16 +93,90 @@
     }
   }
 
+  /* Texts are HTML over the scene, in the font of the page and sharp. The letters that viser draws are left
+     out: Firefox without a graphics card shows none of them. */
+  const texts = new Map();
+  let letters = null;
+
+  function hideLetters(viewer) {
+    if (letters?.parent) return;
+    viewer.scene.traverse((part) => {
+      if (part.material?.uniforms?.uLabelData) letters = part.parent;
+    });
+    if (letters) letters.visible = false;
+  }
+
+  function textOf(name, viewer) {
+    const known = texts.get(name);
+    if (known?.isConnected) return known;
+    const around = viewer.canvas.parentElement;
+    const place = around.querySelector("[data-scene-texts]") ?? around.appendChild(document.createElement("div"));
+    place.dataset.sceneTexts = "";
+    const text = place.appendChild(document.createElement("span"));
+    texts.set(name, text);
+    return text;
+  }
+
+  const MOVED = { top: 0, left: 0, center: -50, bottom: -100, right: -100 };
+
+  /* Where a label of viser's is, as large and at the same corner; nothing is in front of it. */
+  function write(name, node, viewer) {
+    const { camera, canvas } = viewer;
+    const parent = viewer.nodeRefFromName[name.slice(0, name.lastIndexOf("/"))];
+    if (!camera || !canvas?.parentElement || !parent) return;
+    const { props } = node.message;
+    const text = textOf(name, viewer);
+    const Point = camera.position.constructor;
+    const point = new Point(...(viewer.nodePoseData[name]?.position ?? [0, 0, 0])).applyMatrix4(parent.matrixWorld);
+    const depth = -point.clone().applyMatrix4(camera.matrixWorldInverse).z;
+    text.hidden = node.effectiveVisibility === false || depth <= camera.near;
+    if (text.hidden) return;
+    point.project(camera);
+    const [left, top] = [(point.x + 1) / 2 * canvas.clientWidth, (1 - point.y) / 2 * canvas.clientHeight];
+    const pixels = canvas.clientHeight * camera.zoom / (2 * Math.tan(camera.fov * Math.PI / 360) * depth);
+    const [vertical, horizontal] = props.anchor.split("-");
+    const look = {
+      fontSize: `${(props.font_scene_height * pixels).toFixed(2)}px`,
+      transform: `translate(${left.toFixed(1)}px, ${top.toFixed(1)}px) translate(${MOVED[horizontal]}%, ${MOVED[vertical]}%)`,
+    };
+    if (text.textContent !== props.text) text.textContent = props.text;
+    for (const [part, value] of Object.entries(look)) if (text.style[part] !== value) text.style[part] = value;
+  }
+
+  function forget(nodes) {
+    for (const [name, text] of texts) {
+      if (nodes[name]) continue;
+      text.remove();
+      texts.delete(name);
+    }
+  }
+
+  /* viser begins with surroundings of its own, in which surfaces are pale, and decodes ours when it hears of
+     them: from then on they have another intensity, and the next picture of surroundings is ours. */
+  const OWN_INTENSITY = 1;
+  let surroundings = null;
+  let isLit = false;
+
+  function seeLight({ environment, environmentIntensity }) {
+    const isOther = environment !== surroundings;
+    surroundings = environment;
+    isLit ||= isOther && environmentIntensity !== OWN_INTENSITY;
+  }
+
   const painted = new Set();
+  let contentCame = null;
 
   function follow() {
     requestAnimationFrame(follow);
     const [tree, viewer] = [window.__viserSceneTree, window.__viserMutable];
     if (!tree || !viewer) return;
     light(viewer);
+    if (viewer.scene && !isLit) seeLight(viewer.scene);
     if (isRecording) keepSides(viewer);
     let [isChanged, hasContent] = [false, false];
-    for (const [name, node] of Object.entries(tree.getState())) {
+    const nodes = tree.getState();
+    for (const [name, node] of Object.entries(nodes)) {
+      if (node?.message.type === "LabelMessage") write(name, node, viewer);
       const colors = node?.message.type === "MeshMessage" ? node.message.props.color : [];
       const group = viewer.nodeRefFromName[name];
       if (!group) continue;
@@ -113,8 +188,13 @@
         isChanged = unpaint(group) || isChanged;
       }
     }
+    if (texts.size > 0) {
+      hideLetters(viewer);
+      forget(nodes);
+    }
+    if (hasContent) contentCame ??= performance.now();
     if (isChanged) viewer.requestRender();
-    else if (hasContent) uncover();
+    else if (hasContent && (isLit || performance.now() - contentCame > UNLIT_MS)) uncover();
   }
 
   /* Here is no body yet, so that nothing is seen before. */
@@ -135,7 +215,12 @@
   }
 
   const sheet = new CSSStyleSheet();
-  sheet.replaceSync("canvas { opacity: 1 !important; }");
+  sheet.replaceSync(`
+    canvas { opacity: 1 !important; }
+    [data-scene-texts] { position: absolute; inset: 0; overflow: hidden; pointer-events: none; color: #16181d; font: 16px/1.2 system-ui, sans-serif; text-shadow: 0 0 .2em #fff, 0 0 .2em #fff; }
+    [data-scene-texts] > span { position: absolute; top: 0; left: 0; white-space: pre; text-align: center; }
+    [data-scene-texts] > [hidden] { display: none; }
+    :root[data-mantine-color-scheme=dark] [data-scene-texts] { color: #e8eaed; text-shadow: 0 0 .2em #1a1b1e, 0 0 .2em #1a1b1e; }`);
   document.adoptedStyleSheets.push(sheet);
 
   setTimeout(uncover, LONGEST_MS);

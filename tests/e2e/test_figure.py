@@ -10,6 +10,14 @@ from scene_page import TIMEOUT_MS, ScenePage
 
 pytestmark = pytest.mark.e2e
 FRAME = 30
+_LETTERS = """() => {
+  let count = 0;
+  window.__viserMutable.scene.traverseVisible((part) => {
+    if (part.material?.uniforms?.uLabelData) count += 1;
+  });
+  return count;
+}"""
+"""Counts meshes of letters that are drawn within the scene."""
 
 
 def hue(image: np.ndarray, low: int, high: int) -> np.ndarray:
@@ -26,6 +34,10 @@ def test_the_figure_shows_both_topologies_in_one_picture(
     scene.tab("Play")
     scene.until(lambda: scene.has("PhysTwin-style: simulated 60/60 frames"), "the figure")
     scene.go(FRAME)
+    texts = scene.panel.locator("[data-scene-texts] > span").filter(visible=True)
+    for text in ("ours", "PhysTwin-style", "object nodes", "virtual springs"):
+        expect(texts.get_by_text(text, exact=True)).to_be_in_viewport()
+    assert scene.panel.locator("body").evaluate(_LETTERS) == 0
     picture(scene.page, "figure_view")
     scene.tab("Export")
     with np.load(scene.download("NPZ", tmp_path)) as data:

@@ -494,7 +494,7 @@ class CompareDrawing:
         force = legend_force(force_unit, self._framing.extent)
         texts = ("object nodes", "control nodes", "virtual springs", f"force, {force:g} N")
         widths = (0.7 * line, 0.7 * line, 1.8 * line, force * force_unit)
-        letters = [0.36 * len(text) * line for text in texts]
+        letters = [0.43 * len(text) * line for text in texts]
         spans = [w + 0.5 * line + letter for w, letter in zip(widths, letters, strict=True)]
         x = -0.5 * (sum(spans) + 3 * line)
         for index, (text, width, span) in enumerate(zip(texts, widths, spans, strict=True)):
