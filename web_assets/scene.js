@@ -29,11 +29,12 @@
     inside.document.documentElement.dispatchEvent(copy);
   }
 
-  /* viser takes a ticked box and a list that was chosen from for fields in which somebody types. */
+  /* viser takes a ticked box and a list that was chosen from for fields in which somebody types. Enter ends typing. */
   function keepKeys(inside, root) {
     root.addEventListener("click", (event) => event.target.closest?.("[role=option]") && inside.setTimeout(() => inside.document.activeElement?.blur()));
     root.addEventListener("keydown", (event) => {
       if (event.target.matches?.("input[type=checkbox]") && ![" ", "Tab"].includes(event.key)) press(event, inside);
+      if (event.key === "Enter" && event.target.matches?.(".mantine-NumberInput-input")) inside.setTimeout(() => event.target.blur());
     });
   }
 
