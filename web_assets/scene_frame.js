@@ -8,7 +8,7 @@
 
 {
   const LONGEST_MS = 10000;
-  const UNLIT_MS = 3000;
+  const UNLIT_MS = 1000;
   const LEAST_ASPECT = 1;
   const SHOWN = ["MeshMessage", "PointCloudMessage", "LineSegmentsMessage", "CameraFrustumMessage", "BatchedMeshesMessage", "GaussianSplatsMessage"];
   const LINEAR = Float32Array.from({ length: 256 }, (_, value) => (value < 10.32 ? value / 3294.6 : ((value / 255 + 0.055) / 1.055) ** 2.4));

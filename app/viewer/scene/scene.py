@@ -218,7 +218,8 @@ class SceneDrawing:
         """How much hands hide: all where nothing, overlay or video, is to be seen through them."""
         layers = self.layers
         has_overlay = layers.nodes or layers.controls or layers.virtual_springs
-        is_over = has_overlay or layers.all_controls or layers.looks_from is not None
+        has_overlay = self._content.fitted is not None and (has_overlay or layers.all_controls)
+        is_over = has_overlay or layers.looks_from is not None
         return _SEE_THROUGH if is_over else None
 
     def _draw_observed(

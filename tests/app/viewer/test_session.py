@@ -196,9 +196,11 @@ def test_hands_without_an_object_are_seen_before_the_first_video(
         client.until(lambda: not ground.visible)
         client.set("View from", "view1")
         client.until(lambda: client.nodes["/cameras/view1"]["scale"] > 0.2)
+        assert session._inspector._scene._hand_opacity < 1.0  # The video's hand is seen through it.
         client.set("View from", "Overview")
         client.until(lambda: client.nodes["/cameras/view1"]["scale"] < 0.2)
         client.until(lambda: ground.visible)
+        assert session._inspector._scene._hand_opacity is None
     for query, looks_from in (
         ({"f": "2"}, "view0"),
         ({"f": "2", "cam": "1,1,1,0,0,0"}, None),
