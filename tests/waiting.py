@@ -9,6 +9,8 @@ Answer = TypeVar("Answer")
 
 LIMIT_S = 300.0
 """So long a machine may be busy with something else; what takes longer does not happen [s]."""
+_REST = 6.0
+"""So many times as long as asking took, the processor is left to others."""
 
 
 def until(
@@ -19,12 +21,16 @@ def until(
     Args:
         ask: What is waited for.
         tell: What the failure says, asked when time is up.
-        interval: How long to leave the processor to others before asking again [s].
+        interval: How long to leave the processor to others before asking again, at least [s].
+            What takes long to ask, such as a page, is asked for seldom: what is waited for wants
+            the processor too.
     """
     end = time.monotonic() + LIMIT_S
+    begin = time.process_time()
     while not (answer := ask()):
         assert time.monotonic() < end, f"it did not come true within {LIMIT_S:g} s: {tell()}"
-        time.sleep(interval)
+        time.sleep(max(interval, _REST * (time.process_time() - begin)))
+        begin = time.process_time()
     return answer
 
 
