@@ -35,6 +35,10 @@ logger = logging.getLogger(__name__)
 
 _FORMATS = {".glb": "gltf", ".usd": "usd", ".npz": "npz", ".csv": "csv", ".ply": "ply", "": "ply"}
 
+Measure = Callable[..., ndarray]
+"""Measures something of a model, its parameters and a state, as `spring_tensions` does."""
+_FEWEST_STOPS = 8
+
 
 @dataclass(eq=False, kw_only=True)
 class ObjectRollout:
@@ -191,6 +195,64 @@ class ObjectRollout:
     def tensions(self, frame: int) -> Float[ndarray, " spring"]:
         """Compute how hard each spring pulls its ends together [N]."""
         return spring_tensions(self.model_in(frame), self.parameters, *self.state(frame))
+
+    def mean_tensions(self, device: str = "cpu") -> Float[ndarray, "frame spring"]:
+        """Average the tension of each spring over the substeps on the way to each frame [N].
+
+        Springs oscillate faster than frames show, so `tensions` of single moments jitter from frame
+        to frame; curves over time are better plotted of these. See `frame_means`.
+        """
+        return self.frame_means(spring_tensions, device)
+
+    def mean_forces(self, device: str = "cpu") -> Float[ndarray, "frame node 3"]:
+        """Average the virtual springs' force on each node over the way to each frame [N].
+
+        As `mean_tensions`, for `forces`.
+        """
+        return self.frame_means(virtual_forces, device)
+
+    def frame_means(self, measure: Measure, device: str = "cpu") -> Float[ndarray, "frame ..."]:
+        """Average what is measured of model and state over the substeps on the way to each frame.
+
+        Simulates the frames that are ready once more, with the same substeps, and stops at least
+        eight times on the way to each (at all of its substeps, if they are fewer).
+
+        Args:
+            measure: Takes the model of a frame, the parameters and, at one moment, positions and
+                velocities of the object nodes and of the control nodes [m, m/s].
+            device: Warp device.
+
+        Returns:
+            Means by the trapezoidal rule; of frame 0, on whose way nothing is, the value itself.
+
+        Raises:
+            SimulationDivergedError: If the motion runs away.
+        """
+        from physhandi.simulation.simulator import Simulator
+
+        given = self.parameters
+        count, each = _stops(given.substeps_per_frame)
+        duration = 1.0 / (given.simulated_frame_rate * count)
+        finer = given.replace(frame_duration=duration, substeps_per_frame=each)
+        simulator = Simulator(self.model, finer, device)
+        simulator.reset(*(self.start or ()))
+        means = [np.asarray(measure(self.model_in(0), given, *self.state(0)), np.float64)]
+        for frame in range(1, self.ready):
+            if self.restart is not None and frame == self.restart.frame + 1:
+                simulator.continue_from(self.restart, self.control[frame - 1])
+            model, (_, _, end, moving) = self.model_in(frame), self.state(frame)
+            begin = end - (self.control[frame] - self.control[frame - 1])
+            mean, before = np.float64(0.0), begin
+            for stop in range(count + 1):
+                place = begin + np.float32(stop / count) * (end - begin)
+                if stop > 0:
+                    simulator.step_frame(frame, before, place)
+                state = simulator.position.numpy(), simulator.velocity.numpy(), place, moving
+                weight = (0.5 if stop in {0, count} else 1.0) / count
+                mean = mean + weight * np.asarray(measure(model, given, *state), np.float64)
+                before = place
+            means.append(mean)
+        return np.stack(means)
 
     def state(self, frame: int) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """Collect positions and velocities of object nodes, then of control nodes [m, m/s]."""
@@ -354,6 +416,12 @@ def load_surface(
     except PhysHandiError as error:  # What can be told of the object does not need a recording.
         logger.info("the surface of the object has no colors: %s", error)
         return surface
+
+
+def _stops(substeps: int) -> tuple[int, int]:
+    """Divide a frame's substeps into at least eight equal parts: how many, and substeps of each."""
+    each = next((n for n in range(substeps // _FEWEST_STOPS, 1, -1) if substeps % n == 0), 1)
+    return substeps // each, each
 
 
 def _difference(

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from hanging_node import hanging_node
 from safetensors.numpy import save_file
 from viewer_world import PARAMETERS, make_run
 
@@ -175,6 +176,53 @@ def test_what_is_exported_tells_the_springs_after_a_restart(restarted, tmp_path:
         np.testing.assert_array_equal(arrays["restart_rest_length"], later)
     rollout.ready = AT
     assert rollout.restart_arrays() == {}
+
+
+def test_tension_is_averaged_over_what_lies_between_frames() -> None:
+    omega, gravity, rate = 2 * np.pi * 40.0, 9.81, 30.0
+    rollout = hanging_node(stiffness=np.array([0.1 * omega**2], np.float32))
+    simulator = Simulator(rollout.model, rollout.parameters)
+    for frame, position, velocity in simulator.frames(rollout.control):
+        rollout.position[frame], rollout.velocity[frame] = position, velocity
+    rollout.ready = rollout.frame_count
+    # From its rest length, the node swings about where the spring bears it.
+    time = np.arange(rollout.frame_count) / rate
+    moment = gravity * (1 - np.cos(omega * time))
+    mean = gravity * (1 - rate / omega * np.diff(np.sin(omega * time)))
+    shown = np.array([float(rollout.tensions(frame)[0]) for frame in range(rollout.ready)])
+    np.testing.assert_allclose(shown, moment, atol=0.8)
+    found = rollout.mean_tensions()
+    assert found.shape == (rollout.ready, 1)
+    assert found[0, 0] == pytest.approx(shown[0])
+    np.testing.assert_allclose(found[1:, 0], mean, atol=0.3)
+    assert np.std(shown) > 6.0
+    assert np.std(found[1:]) < 1.5
+    pull = rollout.mean_forces()
+    np.testing.assert_allclose(pull[:, 0], found * np.array([0.0, 0.0, 1.0]), atol=1e-5)
+    np.testing.assert_array_equal(pull[:, 1], 0.0)
+
+
+def test_averages_are_taken_on_the_way_of_the_rollout_also_after_a_restart(restarted) -> None:
+    rollout = FittedObject.of(restarted, "lift").simulate()
+    moments = []
+
+    def remember(model, parameters, position, velocity, control, moved) -> np.ndarray:
+        assert parameters is rollout.parameters
+        moments.append((position.copy(), control))
+        return model.rest_length
+
+    found = rollout.frame_means(remember)
+    for frame in (1, AT, AT + 1, rollout.ready - 1):
+        expected = rollout.model_in(frame).rest_length
+        np.testing.assert_allclose(found[frame], expected, rtol=1e-6)
+    count = (len(moments) - 1) // (rollout.ready - 1)
+    assert count - 1 >= 8
+    for frame in range(1, rollout.ready):
+        begin, end = moments[1 + count * (frame - 1)], moments[count * frame]
+        seen = rollout.restart.position if frame == AT + 1 else rollout.position[frame - 1]
+        np.testing.assert_allclose(begin[0], seen, atol=2e-5)
+        np.testing.assert_allclose(end[0], rollout.position[frame], atol=2e-5)
+        np.testing.assert_array_equal(end[1], rollout.held_control(frame))
 
 
 def test_only_the_sequence_that_was_observed_restarts(run, restarted) -> None:

@@ -1,7 +1,7 @@
 """What there is to read of one thing in the scene."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,14 +15,17 @@ from app.viewer.content.layers import Coloring
 from app.viewer.inspect.picking import Pick, PickKind
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.contact_intervals import NEVER
+from physhandi.simulation.forces import spring_tensions, virtual_spring_forces
 from physhandi.simulation.model import SpringMassModel
 
-HistoryQuantity = Literal["speed", "force", "strain", "error", "difference", "height", "length"]
+HistoryQuantity = Literal[
+    "speed", "force", "mean force", "strain", "error", "difference", "height", "length"
+]
 """What a chart can show of a thing."""
 HISTORIES: dict[PickKind, tuple[HistoryQuantity, ...]] = {
-    "node": ("speed", "force", "strain", "error", "difference", "height"),
-    "spring": ("strain", "force", "length"),
-    "control": ("speed", "force", "height"),
+    "node": ("speed", "force", "mean force", "strain", "error", "difference", "height"),
+    "spring": ("strain", "force", "mean force", "length"),
+    "control": ("speed", "force", "mean force", "height"),
     "hand": ("speed", "height"),
     "marker": ("speed", "height"),
 }
@@ -37,6 +40,8 @@ def follow(
     painter: Painter,
 ) -> Float[ndarray, " frame"]:
     """Follow one value of a thing over the frames that are ready, in SI units.
+
+    What is averaged between frames is simulated once more, so it is not known before all are ready.
 
     Args:
         pick: The thing.
@@ -56,22 +61,25 @@ def follow(
             [rollout.position[: rollout.ready], rollout.control[: rollout.ready]], axis=1
         )
         return np.linalg.norm(point[:, second] - point[:, first], axis=-1).astype(np.float64)
+    if kind == "mean force":
+        return _mean_force(rollout, pick)
     part = reduced(rollout, pick)
     if pick.kind == "control":
         return np.array(
             [_of_control(pick.index, kind, part, frame) for frame in range(rollout.ready)]
         )
     values = [painter.measure(kind, part, frame) for frame in range(rollout.ready)]
-    if pick.kind == "spring":
-        return np.array([float(value.spring[0].mean()) for value in values])
-    return np.array([float(value.node[pick.index]) for value in values])
+    is_spring = pick.kind == "spring"
+    return np.array(
+        [float(v.spring[0].mean() if is_spring else v.node[pick.index]) for v in values]
+    )
 
 
 def unit_of(kind: HistoryQuantity, content: Content, painter: Painter) -> tuple[str, float]:
     """Tell the unit in which a history is written, and its number in one SI unit."""
     if kind == "height" or kind == "length":  # noqa: PLR1714  # narrows the type
         return length_unit(content)
-    quantity = painter.quantity(kind)
+    quantity = painter.quantity("force" if kind == "mean force" else kind)
     return quantity.unit, quantity.factor
 
 
@@ -104,14 +112,20 @@ def virtual_springs_at(rollout: ObjectRollout, point: int, frame: int) -> Int[nd
 
 def reduced(rollout: ObjectRollout, pick: Pick) -> ObjectRollout:
     """Keep only the springs that matter to a thing, so that all its frames are read quickly."""
-    model = rollout.model
+    smaller = _with_springs(rollout.model, _springs_of(rollout, pick))
+    return replace(rollout, model=smaller, hand_shift=rollout.shift_of_hands())
+
+
+def _springs_of(rollout: ObjectRollout, pick: Pick) -> Int[ndarray, " spring"]:
     if pick.kind == "spring":
-        chosen = np.array([pick.index])
-    else:
-        chosen = springs_at(
-            rollout, pick.index + (model.node_count if pick.kind == "control" else 0)
-        )
-    smaller = replace(
+        return np.array([pick.index])
+    before = rollout.model.node_count if pick.kind == "control" else 0
+    return springs_at(rollout, pick.index + before)
+
+
+def _with_springs(model: SpringMassModel, chosen: Int[ndarray, " spring"]) -> SpringMassModel:
+    """Leave out all springs but some."""
+    return replace(
         model,
         spring_nodes=model.spring_nodes[chosen],
         rest_length=model.rest_length[chosen],
@@ -122,7 +136,21 @@ def reduced(rollout: ObjectRollout, pick: Pick) -> ObjectRollout:
             chosen[chosen >= model.object_spring_count] - model.object_spring_count
         ],
     )
-    return replace(rollout, model=smaller, hand_shift=rollout.shift_of_hands())
+
+
+def _mean_force(rollout: ObjectRollout, pick: Pick) -> Float[ndarray, " frame"]:
+    """Average the pull of a spring, or the force on a node or control node, between frames [N]."""
+    if not rollout.is_complete:
+        return np.full(rollout.ready, np.nan)
+    chosen = _springs_of(rollout, pick)
+
+    def measure(model: SpringMassModel, *state: Any) -> ndarray:
+        part = _with_springs(model, chosen)
+        if pick.kind == "spring":
+            return spring_tensions(part, *state)
+        return virtual_spring_forces(part, *state).sum(axis=0)
+
+    return np.linalg.norm(rollout.frame_means(measure), axis=1)
 
 
 def _of_track(

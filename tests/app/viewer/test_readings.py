@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hanging_node import hanging_node
 from spring_world import content_of, two_springs
 from viewer_world import content_of as sheet_with_hands
 from viewer_world import controls
@@ -14,6 +15,7 @@ from app.viewer.color.quantities import QUANTITIES
 from app.viewer.inspect.picking import Pick
 from app.viewer.inspect.readings import HISTORIES, Readings, follow, unit_of
 from physhandi.simulation.restart import Restart
+from physhandi.simulation.simulator import Simulator
 
 
 @pytest.fixture
@@ -132,6 +134,29 @@ def test_histories_follow_one_thing_over_all_frames(world):
         for history in histories:
             if kind not in {"hand", "marker"}:
                 assert len(of(kind, 0, history)[1]) == 4
+
+
+def test_a_force_is_averaged_between_frames_once_all_of_them_are_ready():
+    take = hanging_node(stiffness=np.array([6300.0], np.float32))
+    simulator = Simulator(take.model, take.parameters)
+    for frame, position, velocity in simulator.frames(take.control):
+        take.position[frame], take.velocity[frame] = position, velocity
+    take.ready = take.frame_count - 1
+    content = content_of(take)
+    painter = Painter(content)
+
+    def of(kind, index):
+        return follow(Pick(kind=kind, index=index), "mean force", take, content, painter)
+
+    assert np.isnan(of("node", 0)).all()
+    take.ready += 1
+    own = take.mean_tensions()[:, 0]
+    for kind in ("spring", "control", "node"):
+        np.testing.assert_allclose(of(kind, 0), np.abs(own), rtol=1e-5, atol=1e-3)
+    assert 7.0 < own[1:].min() < own[1:].max() < 13.0
+    # Of a node on no spring.
+    np.testing.assert_array_equal(of("node", 1), 0.0)
+    assert unit_of("mean force", content, painter)[0] == "N"
 
 
 def test_a_hand_s_vertex_is_the_control_node_that_it_is():
