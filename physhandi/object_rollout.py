@@ -242,7 +242,7 @@ class ObjectRollout:
                 simulator.continue_from(self.restart, self.control[frame - 1])
             model, (_, _, end, moving) = self.model_in(frame), self.state(frame)
             begin = end - (self.control[frame] - self.control[frame - 1])
-            mean, before = np.float64(0.0), begin
+            mean, before = np.zeros_like(means[0]), begin
             for stop in range(count + 1):
                 place = begin + np.float32(stop / count) * (end - begin)
                 if stop > 0:
