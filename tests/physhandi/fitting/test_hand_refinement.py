@@ -157,8 +157,8 @@ FALLING = SOFT.replace(gravity=9.81, ground_height=0.06)
 
 @pytest.mark.parametrize(
     ("every", "parameters"),
-    [(1, SOFT), (3, SOFT), (3, FALLING)],
-    ids=["all vertices", "a third of them", "on the ground"],
+    [(1, SOFT), (3, FALLING)],
+    ids=["all vertices", "a third of them, on the ground"],
 )
 def test_the_gradient_agrees_with_central_differences_in_float64(
     every: int, parameters: SimulationParameters
@@ -184,7 +184,7 @@ def test_the_gradient_agrees_with_central_differences_in_float64(
             found = value.grad.double().numpy()
             scale = np.abs(found).max()
             frame = np.unravel_index(np.abs(found).argmax(), found.shape)
-            picked = [frame, *(tuple(random.integers(n) for n in found.shape) for _ in range(2))]
+            picked = [frame, tuple(random.integers(n) for n in found.shape)]
             for index in picked:
                 change = []
                 for sign in (1.0, -1.0):
@@ -216,7 +216,7 @@ def test_a_shift_of_the_whole_hand_is_found_with_its_sign_and_size() -> None:
 def test_hands_that_explain_everything_are_left_alone() -> None:
     truth = two_hands(frames=6)
     problem = held_patch(truth, truth, fitted=5)
-    result = refine_hands(problem, FREE, NullProgress())
+    result = refine_hands(problem, FREE.replace(iterations=6), NullProgress())
     assert result.loss_before < 1e-12
     for before, after in zip(problem.motions, result.motions, strict=True):
         np.testing.assert_allclose(after.wrist_translation, before.wrist_translation, atol=1e-7)
@@ -240,7 +240,7 @@ def test_the_result_is_simulated_from_what_is_returned() -> None:
 def test_frames_that_are_not_fitted_fade_to_stage_1() -> None:
     truth = (grasping(frames=10),)
     problem = held_patch(truth, (moved(truth[0], (0.005, 0.0, 0.0)),), fitted=6)
-    config = FREE.replace(carry_time=0.1)
+    config = FREE.replace(carry_time=0.1, iterations=15)
     after = refine_hands(problem, config, NullProgress()).motions[0]
     found = after.wrist_translation - problem.motions[0].wrist_translation
     assert np.linalg.norm(found[5]) > 1e-3
@@ -272,8 +272,9 @@ def test_keypoints_keep_a_hand_in_the_images() -> None:
     truth = (grasping(frames=6),)
     wrong_object = (moved(truth[0], (0.0, 0.006, 0.0)),)
     problem = with_targets(held_patch(wrong_object, truth, fitted=6), 6)
-    free = refine_hands(problem, FREE, NullProgress())
-    held = refine_hands(problem, FREE.replace(keypoint_weight=1e-5), NullProgress())
+    config = FREE.replace(iterations=15)
+    free = refine_hands(problem, config, NullProgress())
+    held = refine_hands(problem, config.replace(keypoint_weight=1e-5), NullProgress())
     assert mpjpe(free.motions[0], truth[0]) > 2 * mpjpe(held.motions[0], truth[0])
     assert mpjpe(free.motions[0], truth[0]) > 0.003
 
@@ -349,17 +350,18 @@ def test_hands_that_diverge_from_the_start_are_an_error(monkeypatch: pytest.Monk
         refine_hands(problem, FREE, NullProgress())
 
 
-@pytest.mark.parametrize(("failures", "share"), [(1, 0.5), (2, 0.25), (4, 0.0)])
+@pytest.mark.parametrize(("failures", "share"), [(2, 0.25), (4, 0.0)])
 def test_a_correction_that_diverges_later_is_halved_and_at_last_dropped(
     monkeypatch: pytest.MonkeyPatch, failures: int, share: float
 ) -> None:
     truth = (grasping(frames=8),)
     problem = held_patch(truth, (moved(truth[0], (0.005, 0.0, 0.0)),), fitted=5)
-    whole = refine_hands(problem, FREE, NullProgress()).motions[0]
+    config = FREE.replace(iterations=8)
+    whole = refine_hands(problem, config, NullProgress()).motions[0]
     broken = diverges(at=set(range(failures)), real=Simulator.rollout)
     monkeypatch.setattr(Simulator, "rollout", broken)
     listener = Listener()
-    part = refine_hands(problem, FREE, listener).motions[0]
+    part = refine_hands(problem, config, listener).motions[0]
     before = problem.motions[0].wrist_translation
     moved_by = share * (whole.wrist_translation - before)
     np.testing.assert_allclose(part.wrist_translation - before, moved_by, atol=1e-7)
