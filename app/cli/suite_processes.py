@@ -48,12 +48,13 @@ class SuiteProcesses:
                 GPU, it is their `ONLY_CARD`, which orders name.
         """
         self._progress = progress
-        self._free: queue.SimpleQueue[_Process] = queue.SimpleQueue()
+        # What was free last comes first: a start costs seconds, and few pieces need few of them.
+        self._free: queue.LifoQueue[_Process] = queue.LifoQueue()
         self._all = [
             _Process(share, only_card(card_of(devices[number % len(devices)])))
             for number, share in enumerate(_shares(count))
         ]
-        for process in self._all:
+        for process in reversed(self._all):
             self._free.put(process)
         self._pool = ThreadPoolExecutor(count, thread_name_prefix="suite")
 

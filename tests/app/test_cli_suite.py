@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.run import Run
 from physhandi.synthetic.code_version import generator_version
-from physhandi.synthetic.suite.suite import find_suite
+from physhandi.synthetic.suite.suite import FLOOR, SUITES, find_suite
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -128,26 +129,41 @@ def test_an_order_that_makes_no_sense_writes_nothing(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_the_tiny_suite_is_made_and_evaluated_by_one_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_tiny_suite_is_made_by_one_command_and_taken_up_by_the_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mujoco")
     out = tmp_path / "tiny"
     order = ("--suite", "tiny", "--out", out, "--device", "cpu")
-    code, told, error = call(capsys, *order, "--jobs", "2", "--json")
+    tiny = find_suite("tiny")
+    tiny = replace(
+        tiny,
+        methods=("static", "quick", FLOOR, "oracle_hand"),
+        recording={**tiny.recording, "frames": 12},
+    )
+    monkeypatch.setitem(SUITES, "tiny", tiny)
+    # The process that makes the sequence fills the only cell, too.
+    code, told, error = call(capsys, *order, "--methods", "static", "--jobs", "2", "--json")
     assert code == 0, error
-    assert json.loads(told)["seconds"] > 5
-    assert "--suite tiny --jobs 2 --device cpu" in (out / "report.md").read_text()
+    assert json.loads(told)["seconds"] > 1
+    command = "evaluate suite --suite tiny --methods static --jobs 2 --device cpu"
+    assert command in (out / "report.md").read_text()
+    alone = rows_of(out / "table.csv")
+    # What follows is computed here, where all that computes is imported already.
+    code, _, error = call(capsys, *order)
+    assert code == 0, error
     rows = rows_of(out / "table.csv")
-    assert tuple(dict.fromkeys(method for method, *_ in rows)) == find_suite("tiny").methods
+    assert alone.items() <= rows.items()  # What was known stays.
+    assert tuple(dict.fromkeys(method for method, *_ in rows)) == tiny.methods
     for split in ("reconstruction", "future"):
         still = rows["static", split, "track_error"]
         assert 0.001 < rows["quick", split, "track_error"] < 0.8 * still
+        # Another engine made it: the true hand does not make a perfect object.
+        assert 0.001 < rows["oracle_hand", split, "track_error"] < still
         # Nodes carried by the truth miss what was observed by their spacing alone.
         assert rows["true_motion", split, "track_error"] < 0.003
         floor = rows["true_motion", split, "chamfer_phystwin"]
         assert 0.001 < floor < rows["quick", split, "chamfer_phystwin"]
-    assert rows["phystwin", "future", "chamfer_phystwin"] > 0.002
     assert 0.001 < rows["quick", "hands", "mpjpe"] < 0.02
     (folder,) = (out / "sequences").iterdir()
     sequence = Sequence.load(folder)
@@ -157,16 +173,8 @@ def test_the_tiny_suite_is_made_and_evaluated_by_one_command(
     assert contact_point is not None
     assert 50 < len(contact_point) <= 441
     fits = list((out / "cells").glob(f"{sequence.name}-*"))
-    assert len(fits) == len(find_suite("tiny").methods)
+    assert {fit.name.split("-")[1] for fit in fits} >= set(tiny.methods)
     for fit in fits:
         nodes = Run.open(fit).array(f"sequences/{sequence.name}/rollout.npy").shape[1]
         assert 50 < nodes <= 441
-    code, _, error = call(capsys, *order, "--methods", "oracle_hand")
-    assert code == 0, error
-    more = rows_of(out / "table.csv")
-    assert rows.items() <= more.items()  # What was known stays.
-    for split in ("reconstruction", "future"):
-        # Another engine made it: the true hand does not make a perfect object.
-        still = rows["static", split, "track_error"]
-        assert 0.001 < more["oracle_hand", split, "track_error"] < still
     shutil.rmtree(out)

@@ -58,7 +58,7 @@ class Watched(Progress):
 
     def __init__(self, stop_at: str = "") -> None:
         self.told: list[tuple[str, int, int, str]] = []
-        self._stop_at = stop_at
+        self.stop_at = stop_at
 
     def report(
         self,
@@ -71,11 +71,11 @@ class Watched(Progress):
         self.told.append((stage, iteration, total, message))
 
     def check_cancelled(self) -> None:
-        if self._stop_at and any(self._stop_at in message for *_, message in self.told):
+        if self.stop_at and any(self.stop_at in message for *_, message in self.told):
             raise CancelledError("stopped")
 
 
-def test_two_processes_give_the_table_of_one_fill_each_cell_once_and_tell_what_is_wrong(
+def test_two_processes_give_the_table_of_one_tell_what_is_wrong_and_end_when_told(
     tmp_path: Path, order: Order
 ) -> None:
     evaluate_suite(order, tmp_path / "one")
@@ -85,8 +85,9 @@ def test_two_processes_give_the_table_of_one_fill_each_cell_once_and_tell_what_i
         found = evaluate_suite(order, out, progress, fill=workers.fill(order, out))
         shares = [process.cpu_affinity() for process in children()]
         assert sorted(shares) == suite_processes._shares(2)
-        told_last = progress.told[-1]
+        told = list(progress.told)
         refuse_in_their_words(workers, order, tmp_path)
+        keep_what_is_finished(workers, replace(order, methods=METHODS[:2]), tmp_path, progress)
     assert (found["cells"], found["failed"], found["skipped"]) == (CELLS, 0, [])
     assert children() == []
     one, two = table(tmp_path / "one"), table(out)
@@ -99,8 +100,8 @@ def test_two_processes_give_the_table_of_one_fill_each_cell_once_and_tell_what_i
     names = [sorted(p.name for p in (tmp_path / n / "cells").iterdir()) for n in ("one", "two")]
     assert names[0] == names[1]
     assert {Run.open(out / "cells" / name).attempt for name in names[1]} == {1}
-    assert told_last[:3] == ("suite", CELLS, CELLS)
-    assert any("quick, low" in message for *_, message in progress.told)
+    assert told[-1][:3] == ("suite", CELLS, CELLS)
+    assert any("quick, low" in message for *_, message in told)
     assert "shared by 2 cells at a time" in (out / "report.md").read_text()
 
 
@@ -114,6 +115,20 @@ def refuse_in_their_words(workers: SuiteProcesses, order: Order, folder: Path) -
     with pytest.raises(UsageError, match="no object named 'brick'"):
         workers.make({folder / "brick": making})
     assert not (folder / "brick").exists()
+
+
+def keep_what_is_finished(
+    workers: SuiteProcesses, order: Order, folder: Path, progress: Watched
+) -> None:
+    """Wish to stop as soon as a second method is begun, and leave processes at work."""
+    progress.stop_at = "quick, low"
+    progress.told.clear()
+    out = folder / "stopped"
+    with pytest.raises(CancelledError):
+        evaluate_suite(order, out, progress, fill=workers.fill(order, out))
+    stored = json.loads((out / "cells.json").read_text())
+    assert {cell["method"] for cell in stored["cells"]} >= {"static"}
+    assert stored["about"]["missing"] > 0
 
 
 def test_whatever_is_made_of_other_cells_comes_last(recordings: tuple[Sequence, ...]) -> None:
@@ -171,69 +186,60 @@ def test_what_a_process_does_is_told_in_a_few_words() -> None:
 
 
 class Killer(Watched):
-    """Kills the process that is at work on a cell, so often, while the cell cannot be finished."""
+    """Kills the process at work on a cell, as often as told, while the cell cannot be finished."""
 
-    def __init__(self, cell: str, times: int, lock: Path) -> None:
+    def __init__(self, order: Order, out: Path, times: dict[str, int]) -> None:
         super().__init__()
-        lock.parent.mkdir()
-        self._cell = cell
+        self._left = dict(times)
         self._victims: set[int] = set()
-        self._times = times
-        self._held = ExitStack()
-        self._held.enter_context(locked_file(lock))
+        self._held = {method: ExitStack() for method in times}
+        (out / "locks").mkdir()
+        for method, held in self._held.items():
+            held.enter_context(locked_file(lock_of(method, order, out)))
 
-    def report(self, *about: Any, **more: Any) -> None:
-        super().report(*about, **more)
+    def check_cancelled(self) -> None:
+        method = self.told[-1][3].split(",")[0] if self.told else ""
         alive = [process for process in children() if process.pid not in self._victims]
-        is_busy = self.told[-1][3].startswith(self._cell) and alive
-        if is_busy and len(self._victims) < self._times:
+        if alive and self._left.get(method):
+            self._left[method] -= 1
             self._victims.add(alive[0].pid)
             alive[0].send_signal(signal.SIGKILL)
-        if len(self._victims) == self._times:
-            self._held.close()
+            if not self._left[method]:
+                self._held[method].close()
 
 
-def lock_of_quick(order: Order, out: Path) -> Path:
-    """The lock that whoever fills the cell of `quick` holds."""
+def lock_of(method: str, order: Order, out: Path) -> Path:
+    """The lock that whoever fills the first recording's cell of a method holds."""
     work = evaluation._Work(evaluation._read(order)[0], out, NullProgress())
-    cell = work.bench._folder(parse_method("quick"), order.recordings[0], "recording")
+    cell = work.bench._folder(parse_method(method), order.recordings[0], "recording")
     return out / "locks" / cell.name
 
 
 @pytest.fixture
 def small(recordings: tuple[Sequence, ...]) -> Order:
-    return order_of(recordings[:1], methods=("static", "quick"), protocols=("main",))
+    return order_of(recordings[:1], methods=("static", "rigid_follow"), protocols=("main",))
 
 
-def test_a_cell_whose_process_is_killed_is_computed_once_more(tmp_path: Path, small: Order) -> None:
-    lock = lock_of_quick(small, tmp_path)
-    killer = Killer("quick, low", 1, lock)
-    with SuiteProcesses(1, killer) as workers:
-        found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
-    assert (tmp_path / "cells" / lock.name).is_dir()
-    assert children() == []
-    assert (found["cells"], found["failed"], found["skipped"]) == (2, 0, [])
-
-
-def test_a_cell_whose_process_is_killed_twice_is_one_failed_cell_and_tried_by_the_next_command(
+def test_a_cell_is_computed_once_more_by_a_new_process_and_fails_if_that_is_lost_too(
     tmp_path: Path, small: Order, caplog: pytest.LogCaptureFixture
 ) -> None:
-    killer = Killer("quick, low", 2, lock_of_quick(small, tmp_path))
+    killer = Killer(small, tmp_path, {"static": 1, "rigid_follow": 2})
     with SuiteProcesses(1, killer) as workers:
         found = evaluate_suite(small, tmp_path, killer, fill=workers.fill(small, tmp_path))
+    assert children() == []
     assert (found["cells"], found["failed"], found["skipped"]) == (2, 1, [])
     told = r"The process that worked on it ended, 2 times (exit code -9). If memory ran out, take"
-    assert f"quick, low, main: {told}" in caplog.text
+    assert f"rigid_follow, low, main: {told}" in caplog.text
     (cell,) = (c for c in json.loads((tmp_path / "cells.json").read_text())["cells"] if c["error"])
-    assert (cell["method"], cell["case"]) == ("quick", "low")
+    assert (cell["method"], cell["case"]) == ("rigid_follow", "low")
     assert cell["error"].startswith(told)
     scored = table(tmp_path)
     key = ("future", "track_error")
     # As any method without output, it counts as the static object.
-    assert scored["quick", *key]["mean"] == scored["static", *key]["mean"]
+    assert scored["rigid_follow", *key]["mean"] == scored["static", *key]["mean"]
     found = evaluate_suite(small, tmp_path)
     assert (found["cells"], found["failed"]) == (2, 0)
-    assert table(tmp_path)["quick", *key]["mean"] != scored["static", *key]["mean"]
+    assert table(tmp_path)["rigid_follow", *key]["mean"] != scored["static", *key]["mean"]
 
 
 def test_a_lost_cell_without_which_nothing_can_be_scored_is_left_out_and_says_so(
@@ -244,20 +250,8 @@ def test_a_lost_cell_without_which_nothing_can_be_scored_is_left_out_and_says_so
 
     found = evaluate_suite(small, tmp_path, fill=lose)
     assert (found["cells"], found["failed"]) == (0, 0)
-    assert found["skipped"] == [f"{m}, low, main: It was lost." for m in ("static", "quick")]
+    assert found["skipped"] == [f"{m}, low, main: It was lost." for m in small.methods]
     assert not list((tmp_path / "cells").glob("*")) if (tmp_path / "cells").exists() else True
-
-
-def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
-    tmp_path: Path, order: Order
-) -> None:
-    progress = Watched(stop_at="quick, low")
-    with pytest.raises(CancelledError), SuiteProcesses(2, progress) as workers:
-        evaluate_suite(order, tmp_path, progress, fill=workers.fill(order, tmp_path))
-    assert children() == []
-    stored = json.loads((tmp_path / "cells.json").read_text())
-    assert {cell["method"] for cell in stored["cells"]} >= {"static"}
-    assert 0 < stored["about"]["missing"] < CELLS
 
 
 def test_an_order_survives_being_told_to_another_process(order: Order) -> None:
