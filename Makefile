@@ -37,13 +37,18 @@ fmt: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# Each of several processes would compile the same modules; so one does, once.
+$(VENV)/.compiled: $(STAMP)
+	$(BIN)/python -m pytest --collect-only -q >/dev/null
+	touch $@
+
 # Three processes keep two processors busy: one has all browsers, which wait for pictures and answers
 # as often as they compute, and beside each other hold each other up.
-test: install browser
+test: install browser $(VENV)/.compiled
 	$(BIN)/python -m pytest -n 3 --no-loadscope-reorder
 
 # The same tests, with every line counted that they go through: a fifth slower.
-coverage: install browser
+coverage: install browser $(VENV)/.compiled
 	rm -f .coverage .coverage.*
 	$(BIN)/python -m pytest -n 3 --no-loadscope-reorder --cov --cov-report=term
 

@@ -38,7 +38,7 @@ from physhandi.metrics.hands import evaluate_hands
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import NullProgress, Progress
 
-QUICK = HandFitConfig(iterations=110)
+QUICK = HandFitConfig(iterations=160)
 RECORDED = 60
 """Frames of the real recording that are used."""
 
@@ -127,12 +127,12 @@ def test_depth_corrects_a_hand_that_one_view_cannot_place(tmp_path: Path) -> Non
     truth = scene.grasping(frames=6)
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
-    config = HandFitConfig(iterations=60, depth_iterations=0)
+    config = HandFitConfig(iterations=120, depth_iterations=0)
     without = _vertex_error(reconstruct_hands(sequence, config), truth).mean()
     assert without > 0.015
     for is_new in (True, False):
         config = HandFitConfig(
-            iterations=60, depth_iterations=30, starts_at_depth=is_new, fixed_normals=is_new
+            iterations=120, depth_iterations=60, starts_at_depth=is_new, fixed_normals=is_new
         )
         assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.3 * without
 
@@ -195,9 +195,9 @@ def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_on
     truth = replace(scene.grasping(frames=4), scale=1.15)
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
-    config = HandFitConfig(iterations=60, depth_iterations=0)
+    config = HandFitConfig(iterations=120, depth_iterations=0)
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() > 0.05
-    config = HandFitConfig(iterations=60, depth_iterations=40)
+    config = HandFitConfig(iterations=120, depth_iterations=60)
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.012
 
 

@@ -3,7 +3,7 @@
 Nodes, observations and grip are the bundled run's; global parameters are those of one quick fit,
 written down here so that a new bundled run moves no figure. With the true hand the tracks of this
 object err by 5 mm. The hand is the true one plus an error. No keypoints are used, so all that is
-recovered was seen in the object. All 42 reconstruction frames, 10 iterations.
+recovered was seen in the object. All 42 reconstruction frames, 30 iterations.
 """
 
 from pathlib import Path
@@ -39,7 +39,7 @@ NAME = "towel_fold"
 ERROR = 0.010
 FITTED = slice(0, 42)
 FREE = RefinementConfig(
-    iterations=10, decay=0.99, prior_weight=0.05, smoothness_weight=0.03, keypoint_weight=0.0
+    iterations=30, decay=0.99, prior_weight=0.05, smoothness_weight=0.03, keypoint_weight=0.0
 )
 TOWEL = SimulationParameters(
     connection_radius=0.0316,
@@ -78,7 +78,7 @@ def unrefined(run: Run) -> HandMotion:
     return HandMotion.from_tensors(run.tensors(f"sequences/{NAME}/hand_right_initial.safetensors"))
 
 
-def refine(run: Run, motion: HandMotion) -> RefinedHands:
+def refine(run: Run, motion: HandMotion, config: RefinementConfig = FREE) -> RefinedHands:
     folder = run.out / "sequences" / NAME
     object_ = build_problem(
         name=NAME,
@@ -99,7 +99,7 @@ def refine(run: Run, motion: HandMotion) -> RefinedHands:
         motions=(motion,),
         hand_models=(load_hand_model("right"),),
     )
-    return refine_hands(problem, FREE, NullProgress())
+    return refine_hands(problem, config, NullProgress())
 
 
 def test_the_true_hand_is_the_one_that_was_filmed(run: Run, truth: HandMotion) -> None:
@@ -129,7 +129,7 @@ def test_a_third_of_a_random_hand_error_is_recovered(
     right = result.motions[0]
     assert mpjpe(right, truth, FITTED) < 0.7 * mpjpe(wrong, truth, FITTED)
     assert mpvpe(right, truth, FITTED) < 0.75 * mpvpe(wrong, truth, FITTED)
-    assert result.loss_after < 0.5 * result.loss_before
+    assert result.loss_after < 0.3 * result.loss_before
 
 
 @pytest.mark.slow
@@ -148,7 +148,8 @@ def test_without_gradients_through_the_simulator_nothing_is_recovered(
 
     monkeypatch.setattr(hand_refinement.differentiable, "rollout", blind)
     wrong = disturbed[6.0]
-    right = refine(run, wrong).motions[0]
+    # With gradients, 10 iterations recover three tenths already.
+    right = refine(run, wrong, FREE.replace(iterations=10)).motions[0]
     assert mpjpe(right, truth, FITTED) > 0.95 * mpjpe(wrong, truth, FITTED)
 
 

@@ -20,7 +20,7 @@ from physhandi.hand.names import HandSide
 from physhandi.run import Run
 
 BUNDLED = Path(__file__).parents[3] / "sequences"
-FRAMES, FITTED = 14, 10
+FRAMES, FITTED = 24, 17
 """Frames of it that are used, and how many of them are fitted."""
 CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]
 
@@ -30,7 +30,7 @@ def test_a_known_mano_hand_is_found_again(tmp_path: Path, mano: Path, side: Hand
     truth = scene.grasping(side, model="mano")
     keypoint = scene.seen_keypoints([truth], CAMERAS)
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
-    fit = reconstruct_hands(sequence, HandFitConfig(model="mano", iterations=110))
+    fit = reconstruct_hands(sequence, HandFitConfig(model="mano", iterations=160))
     hand = load_hand_model(side, "mano")
     found, expected = fit.motions[0].vertices(hand), truth.vertices(hand)
     assert fit.motions[0].model == "mano"
