@@ -11,6 +11,8 @@ LIMIT_S = 300.0
 """So long a machine may be busy with something else; what takes longer does not happen [s]."""
 _REST = 6.0
 """So many times as long as asking took, the processor is left to others."""
+_LONGEST_REST = 0.1
+"""But no longer than this, or what has come is not seen [s]."""
 
 
 def until(
@@ -29,7 +31,7 @@ def until(
     begin = time.process_time()
     while not (answer := ask()):
         assert time.monotonic() < end, f"it did not come true within {LIMIT_S:g} s: {tell()}"
-        time.sleep(max(interval, _REST * (time.process_time() - begin)))
+        time.sleep(max(interval, min(_LONGEST_REST, _REST * (time.process_time() - begin))))
         begin = time.process_time()
     return answer
 
