@@ -196,10 +196,12 @@ class _Edges:
     """
 
     def __init__(self, face: Int[ndarray, "face 3"]) -> None:
-        ends = np.concatenate([face[:, [1, 2]], face[:, [2, 0]], face[:, [0, 1]]])
-        self.pair, number, count = np.unique(
-            np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True
-        )
+        ends = np.concatenate([face[:, [1, 2]], face[:, [2, 0]], face[:, [0, 1]]]).astype(np.int64)
+        low, high = ends.min(axis=1), ends.max(axis=1)
+        size = int(high.max()) + 1
+        # One number for both ends: NumPy finds equal numbers ten times as fast as equal rows.
+        key, number, count = np.unique(low * size + high, return_inverse=True, return_counts=True)
+        self.pair = np.stack(np.divmod(key, size), axis=1)
         self._of_face = number.reshape(3, -1).T
         self._opposite = face.T.ravel()
         self._number = number.ravel()
