@@ -1,17 +1,24 @@
 """Fixtures that all tests share."""
 
 import atexit
+import functools
 import gc
+import inspect
+import itertools
 import os
 import sys
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import warp as wp
 from recordings import recording
 
 BROWSERS = ("tests/e2e/", "tests/app/benchmarks/test_viewer_benchmark.py")
 """Files whose tests start browsers."""
+
+CHECKED_CALLS = 1_000
+"""Calls of each function, in each process, whose arguments and results have shapes checked."""
 
 
 def pytest_configure(config):
@@ -26,6 +33,28 @@ def pytest_configure(config):
     os.fsync = lambda _descriptor: None
     # When all is over, nothing is gained by a search for garbage.
     atexit.register(gc.freeze)
+    jaxtyping.jaxtyped = _checked_at_first(jaxtyping.jaxtyped)
+
+
+def _checked_at_first(jaxtyped):
+    """Check shapes in a function's first calls: fits call some a hundred thousand times."""
+
+    def decorator(function=None, **options):
+        if function is None:
+            return functools.partial(decorator, **options)
+        checked = jaxtyped(function, **options)
+        if not inspect.isfunction(function):  # Classes, whose constructors come here, too.
+            return checked
+        calls = itertools.count()
+
+        @functools.wraps(function)
+        def call(*args, **kwargs):
+            chosen = checked if next(calls) < CHECKED_CALLS else function
+            return chosen(*args, **kwargs)
+
+        return call
+
+    return decorator
 
 
 @pytest.hookimpl(wrapper=True)

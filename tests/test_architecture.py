@@ -10,6 +10,9 @@ from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
+import beartype
+import jaxtyping
+import numpy as np
 import pytest
 
 Node = TypeVar("Node", bound=ast.AST)
@@ -250,3 +253,16 @@ def test_shapes_that_a_module_tells_are_checked_while_tests_run(pytestconfig) ->
         asks = place.parts[:2] in {("physhandi", part) for part in SHAPED}
         if asks and "from jaxtyping import" in path.read_text():
             assert set(names) & set(checked), f"name {names[-1]} in pyproject.toml"
+
+
+def test_shapes_are_checked_in_the_first_calls_of_a_function() -> None:
+    @jaxtyping.jaxtyped(typechecker=beartype.beartype)
+    def first(point: jaxtyping.Float[np.ndarray, "point 3"]) -> float:
+        return float(point[0, 0])
+
+    wrong = np.ones((2, 4))
+    with pytest.raises(jaxtyping.TypeCheckError, match="point"):
+        first(wrong)
+    for _ in range(1_000):
+        assert first(wrong[:, :3]) == 1.0
+    assert first(wrong) == 1.0  # Checking all calls of a fit takes longer than the fit.
