@@ -14,23 +14,37 @@ Norm = Literal["l1", "l2"]
 
 
 def nearest_distance(
-    point: Float[ndarray, "point 3"], target: Float[ndarray, "target 3"], norm: Norm = "l2"
+    point: Float[ndarray, "point 3"],
+    target: Float[ndarray, "target 3"] | KDTree,
+    norm: Norm = "l2",
 ) -> Float[ndarray, " point"]:
-    """Measure how far each point is from the nearest target, both by the same norm [m]."""
-    if len(target) == 0:
+    """Measure how far each point is from the nearest target, both by the same norm [m].
+
+    Args:
+        point: Points [m].
+        target: Other points [m], or a tree of them, which saves building one for each call.
+        norm: Norm of the distance.
+
+    Raises:
+        ValueError: If there is no target.
+    """
+    tree: Any = target if isinstance(target, KDTree) else KDTree(target)
+    if tree.n == 0:
         raise ValueError("there is no target to measure a distance to")
     if len(point) == 0:
         return np.zeros(0)
-    tree: Any = KDTree(target)
     return np.asarray(tree.query(point, p=1 if norm == "l1" else 2)[0], dtype=np.float64)
 
 
 def chamfer_one_way(
-    observed: Float[ndarray, "point 3"], predicted: Float[ndarray, "node 3"], norm: Norm = "l2"
+    observed: Float[ndarray, "point 3"],
+    predicted: Float[ndarray, "node 3"] | KDTree,
+    norm: Norm = "l2",
 ) -> float:
     """Average the distance from observed points to the nearest predicted node [m].
 
     With ``"l1"`` it is PhysTwin's measure: ``|dx| + |dy| + |dz|``, observed to predicted only.
+    A tree of the nodes does as well as the nodes.
     """
     return float(nearest_distance(observed, predicted, norm).mean()) if len(observed) else np.nan
 

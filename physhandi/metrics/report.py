@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from scipy.spatial import KDTree
 
 from physhandi.data.files import read_array, read_tensors
 from physhandi.data.layout import PARAMETERS_FILE, REST_NODE_FILE, SequenceFiles
@@ -400,11 +401,13 @@ def error_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringRefere
         reference: Observations, and the true surface if it is known.
     """
     surface = nodes[:, : reference.surface_count]
-    curves = _shape_curves(surface, reference) | _track_curves(nodes, reference)
+    trees = [KDTree(frame) for frame in surface]
+    curves = _shape_curves(surface, trees, reference) | _track_curves(nodes, reference)
     if reference.point is not None and reference.is_visible is not None:
         point = reference.point[: len(nodes)].astype(np.float64)
         if point.shape[1]:
-            curves |= _dynamic_curves(surface, point, reference.is_visible[: len(nodes)])
+            is_visible = reference.is_visible[: len(nodes)]
+            curves |= _dynamic_curves(surface, trees, point, is_visible)
     if reference.true_surface is not None:
         curves |= truth_curves(surface, reference.true_surface)
     if reference.marker is not None and reference.marker_node is not None:
@@ -416,25 +419,27 @@ def error_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringRefere
     return curves
 
 
-def _shape_curves(surface: Float[ndarray, "frame node 3"], reference: ScoringReference) -> Curves:
+def _shape_curves(
+    surface: Float[ndarray, "frame node 3"], trees: list[KDTree], reference: ScoringReference
+) -> Curves:
     """CD_full: PhysTwin's, over visible tracks, and ours, over the fused cloud."""
     curves: Curves = {}
     tracks = _visible_tracks(reference, len(surface))
     if tracks:
-        curves["chamfer_phystwin"] = _each(tracks, surface, "l1")
+        curves["chamfer_phystwin"] = _each(tracks, trees, "l1")
     observed = tracks
     if len(reference.cloud) >= len(surface):
         observed = [cloud.astype(np.float64) for cloud in reference.cloud[: len(surface)]]
     if observed:
-        curves["chamfer_l1"] = _each(observed, surface, "l1")
-        curves["chamfer_l2"] = _each(observed, surface, "l2")
-        pairs = zip(observed, surface, strict=True)
-        curves["chamfer_symmetric"] = np.array([chamfer_symmetric(o, n) for o, n in pairs])
+        curves["chamfer_l1"] = _each(observed, trees, "l1")
+        curves["chamfer_l2"] = _each(observed, trees, "l2")
+        curves["chamfer_symmetric"] = 0.5 * (curves["chamfer_l2"] + _back(surface, observed))
     return curves
 
 
 def _dynamic_curves(
     surface: Float[ndarray, "frame node 3"],
+    trees: list[KDTree],
     point: Float[ndarray, "frame track 3"],
     is_visible: Bool[ndarray, "frame track"],
 ) -> Curves:
@@ -444,8 +449,8 @@ def _dynamic_curves(
     start = np.where(is_visible[0][:, None], point[0], np.nan)
     beside = surface[:, dynamic_nodes(surface[0], start, is_dynamic)]
     return {
-        "chamfer_dynamic_l1": _each(moving, surface, "l1"),
-        "chamfer_dynamic_l2": _each(moving, surface, "l2"),
+        "chamfer_dynamic_l1": _each(moving, trees, "l1"),
+        "chamfer_dynamic_l2": _each(moving, trees, "l2"),
         "chamfer_dynamic_symmetric": np.array(
             [chamfer_symmetric(o, n) for o, n in zip(moving, beside, strict=True)]
         ),
@@ -484,9 +489,20 @@ def _visible_tracks(reference: ScoringReference, frame_count: int) -> list[Float
 
 
 def _each(
-    observed: list[Float[ndarray, "_ 3"]], nodes: Float[ndarray, "frame node 3"], norm: Norm
+    observed: list[Float[ndarray, "_ 3"]], trees: list[KDTree], norm: Norm
 ) -> Float[ndarray, " frame"]:
-    return np.array([chamfer_one_way(o, nodes[frame], norm) for frame, o in enumerate(observed)])
+    """From what was observed to the nodes of each frame; NaN where nothing was."""
+    return np.array(
+        [chamfer_one_way(o, tree, norm) for o, tree in zip(observed, trees, strict=True)]
+    )
+
+
+def _back(
+    surface: Float[ndarray, "frame node 3"], observed: list[Float[ndarray, "_ 3"]]
+) -> Float[ndarray, " frame"]:
+    """From the nodes to what was observed of each frame; NaN where nothing was."""
+    pairs = zip(surface, observed, strict=True)
+    return np.array([chamfer_one_way(n, o) if len(o) else np.nan for n, o in pairs])
 
 
 def _unit_of(sequence: Sequence) -> str:
