@@ -31,34 +31,40 @@ class Scene:
     attached: np.ndarray | None = None  # (spring, 2): the states between which each spring acts
 
 
-def spring_force(scene, x, v):
-    """Force on every node, by a dense incidence matrix (spring x node)."""
-    count = len(scene.springs)
-    incidence = np.zeros((count, len(x)))
-    incidence[np.arange(count), scene.springs[:, 0]] = -1.0
-    incidence[np.arange(count), scene.springs[:, 1]] += 1.0
-    gap, rate = incidence @ x, incidence @ v
+def incidence(scene, count):
+    """Tell which springs leave (-1) and reach (1) which of `count` nodes, spring x node."""
+    number = np.arange(len(scene.springs))
+    table = np.zeros((len(scene.springs), count))
+    table[number, scene.springs[:, 0]] = -1.0
+    table[number, scene.springs[:, 1]] += 1.0
+    return table
+
+
+def spring_force(scene, joins, x, v):
+    """Force on every node; `joins` is the incidence of all springs."""
+    gap, rate = joins @ x, joins @ v
     length = np.sqrt((gap**2).sum(1))
     unit = gap / np.maximum(length, 1e-6)[:, None]
     tension = scene.stiffness * (length / scene.rest - 1.0)
     tension = tension + scene.damping * (unit * rate).sum(1)
-    return -incidence.T @ (tension[:, None] * unit)
+    return -joins.T @ (tension[:, None] * unit)
 
 
 def move_on_ground(scene, x, v, dt, plane):
-    """Move one node that may hit its plane: fly to the impact, bounce, fly on."""
-    gap = x[2] - plane
-    if not (gap + v[2] * dt < 0.0 and v[2] < -1e-4):
-        return x + dt * v, v
-    e, mu = np.clip(scene.restitution, 0, 1), np.clip(scene.friction, 0, 2)
-    normal = np.array([0.0, 0.0, 1.0])
-    v_normal = (v @ normal) * normal
-    v_tangent = v - v_normal
-    slide = np.sqrt(v_tangent @ v_tangent)
-    loss = mu * (1 + e) * np.sqrt(v_normal @ v_normal) / max(slide, 1e-6)
-    bounced = max(0.0, 1.0 - loss) * v_tangent - e * v_normal
-    impact = gap / -v[2]
-    return x + impact * v + (dt - impact) * bounced, bounced
+    """Move nodes that may hit their planes: fly to the impact, bounce, fly on."""
+    gap = x[:, 2] - plane
+    hits = (gap + v[:, 2] * dt < 0.0) & (v[:, 2] < -1e-4)
+    moved, velocity = x + dt * v, v.copy()
+    if hits.any():
+        e, mu = np.clip(scene.restitution, 0, 1), np.clip(scene.friction, 0, 2)
+        v_normal, v_tangent = v[hits] * [0.0, 0.0, 1.0], v[hits] * [1.0, 1.0, 0.0]
+        slide = np.sqrt((v_tangent**2).sum(1))
+        loss = mu * (1 + e) * np.sqrt((v_normal**2).sum(1)) / np.maximum(slide, 1e-6)
+        bounced = np.maximum(0.0, 1.0 - loss)[:, None] * v_tangent - e * v_normal
+        impact = (gap[hits] / -v[hits, 2])[:, None]
+        moved[hits] = x[hits] + impact * v[hits] + (dt - impact) * bounced
+        velocity[hits] = bounced
+    return moved, velocity
 
 
 def candidate_table(scene, x):
@@ -104,7 +110,7 @@ def simulate(scene, counts=None):
     plane = np.full(len(x), -np.inf if scene.ground is None else scene.ground)
     if scene.clearance is not None:
         plane += scene.clearance
-    states = [(x, v)]
+    states, joins = [(x, v)], incidence(scene, len(x) + scene.control.shape[1])
     everything = scene
     for frame, (start, end) in enumerate(zip(scene.control[:-1], scene.control[1:], strict=True)):
         if everything.attached is not None:
@@ -117,15 +123,12 @@ def simulate(scene, counts=None):
         may = None if scene.distance is None else candidate_table(scene, x)
         for substep in range(scene.substeps):
             held = start + (end - start) * (substep + 1) / scene.substeps
-            force = spring_force(scene, np.vstack([x, held]), np.vstack([v, rate]))[: len(x)]
+            force = spring_force(scene, joins, np.vstack([x, held]), np.vstack([v, rate]))[: len(x)]
             free = (v + dt * (force + weight)) * np.exp(-dt * scene.drag)
             if may is not None:
                 free, count = collisions(scene, may, x, free)
                 if counts is not None:
                     counts.append(count)
-            moved = [
-                move_on_ground(scene, *node, dt, p) for *node, p in zip(x, free, plane, strict=True)
-            ]
-            x, v = np.array([m[0] for m in moved]), np.array([m[1] for m in moved])
+            x, v = move_on_ground(scene, x, free, dt, plane)
         states.append((x, v))
     return np.array([s[0] for s in states]), np.array([s[1] for s in states])
