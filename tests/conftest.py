@@ -37,19 +37,22 @@ def pytest_configure(config):
 
 
 def _checked_at_first(jaxtyped):
-    """Check shapes in a function's first calls: fits call some a hundred thousand times."""
+    """Check shapes in a function's first calls: fits call some a hundred thousand times.
+
+    What checks them is made at the first call, since most functions are called by few tests.
+    """
 
     def decorator(function=None, **options):
         if function is None:
             return functools.partial(decorator, **options)
-        checked = jaxtyped(function, **options)
-        if not inspect.isfunction(function):  # Classes, whose constructors come here, too.
-            return checked
+        if not inspect.isfunction(function):  # Classes, whose constructors are checked throughout.
+            return jaxtyped(function, **options)
+        checked = functools.cache(lambda: jaxtyped(function, **options))
         calls = itertools.count()
 
         @functools.wraps(function)
         def call(*args, **kwargs):
-            chosen = checked if next(calls) < CHECKED_CALLS else function
+            chosen = checked() if next(calls) < CHECKED_CALLS else function
             return chosen(*args, **kwargs)
 
         return call
