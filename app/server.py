@@ -142,7 +142,8 @@ def create_app(
     app.state.scheduler, app.state.sessions, app.state.security = scheduler, sessions, security
     models = ModelFolders(settings)
     overview = Overview(settings, catalog, scheduler, machine)
-    app.include_router(
+    figures = CollectorRegistry()
+    routers = [
         create_api(
             catalog,
             scheduler,
@@ -156,9 +157,7 @@ def create_app(
             uploads=uploads,
             recovery=recovery,
             retention=retention,
-        )
-    )
-    app.include_router(
+        ),
         create_pages(
             catalog,
             scheduler,
@@ -172,25 +171,24 @@ def create_app(
             recovery=recovery,
             retention=retention,
             suites=settings.suite_dir,
-        )
-    )
-    app.include_router(
-        create_exports(
+        ),
+        *create_exports(
             catalog,
             sessions,
             pages,
             file_cache,
             Shares(settings.data_dir / "shares"),
             root_path=settings.root_path,
-        )
-    )
-    app.include_router(create_comparing(catalog, scheduler, pages))
-    app.include_router(create_gate(sessions))
+        ),
+        create_comparing(catalog, scheduler, pages),
+        create_gate(sessions),
+        create_health(catalog, scheduler, sessions, machine, figures),
+    ]
+    for router in routers:
+        # Taken over, not included: that would build each route once more at the first request.
+        app.routes.extend(router.routes)
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
 
-    app.include_router(
-        create_health(catalog, scheduler, sessions, machine, figures := CollectorRegistry())
-    )
     _answer_errors(app, pages)
     _guard(app, security, figures, audit_log, root_path=settings.root_path)
     return app

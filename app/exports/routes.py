@@ -20,7 +20,7 @@ def create_exports(
     shares: Shares,
     *,
     root_path: str = "",
-) -> APIRouter:
+) -> list[APIRouter]:
     """Make the routes of links, replays, shared pages and files, and let scenes know their links.
 
     Args:
@@ -32,9 +32,9 @@ def create_exports(
         root_path: Path below which the application is reached.
     """
     sessions.link_of = lambda session: f"{root_path}{link_of(session)}"
-    router = APIRouter()
-    router.include_router(create_links(sessions))
-    router.include_router(create_files(catalog, sessions, file_cache))
-    router.include_router(create_replays(catalog, file_cache, pages))
-    router.include_router(create_shares(catalog, file_cache, shares))
-    return router
+    return [
+        create_links(sessions),
+        create_files(catalog, sessions, file_cache),
+        create_replays(catalog, file_cache, pages),
+        create_shares(catalog, file_cache, shares),
+    ]

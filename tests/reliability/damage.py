@@ -14,7 +14,6 @@ from unittest.mock import patch
 
 import numpy as np
 from damaged_files import damage_file
-from fastapi.routing import iter_route_contexts
 from old_data import differences, read_record, serve, settle, unpack
 from server_world import World, fit_sheet, make_world
 from sheet_sequence import write_sheet
@@ -109,9 +108,9 @@ def _ask_for_all(world: World, damaged: dict[str, list[str]], counts: Counter[st
 
 def _addresses(world: World) -> Iterator[str]:
     listed = {path for path, methods in world.app.openapi()["paths"].items() if "get" in methods}
-    for route in iter_route_contexts(world.app.routes):
+    for route in world.app.routes:
         if "GET" in (getattr(route, "methods", None) or ()):
-            listed.add(str(route.path))
+            listed.add(route.path)
     yield from sorted(
         path
         for path in listed - _STARTS_A_PROCESS
