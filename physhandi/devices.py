@@ -43,6 +43,8 @@ def pick_device(name: str) -> str:
     Raises:
         UsageError: If the named device does not exist here.
     """
+    if name == "cpu" or (name == "auto" and not has_cuda_driver()):
+        return "cpu"  # Known without Warp, which takes half a second to import and start.
     import warp as wp
 
     start_warp()
@@ -64,10 +66,12 @@ def pick_devices(names: str) -> tuple[str, ...]:
     Raises:
         UsageError: If a device does not exist here, one is named twice, or a CPU beside GPUs.
     """
-    import warp as wp
-
-    start_warp()
+    if names == "all" and not has_cuda_driver():
+        return ("cpu",)
     if names == "all":
+        import warp as wp
+
+        start_warp()
         return tuple(str(device) for device in wp.get_cuda_devices()) or ("cpu",)
     named = [name.strip() for name in names.split(",")]
     if len(named) > 1 and "cpu" in named:

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import MovingSurface, SceneData, read_scene
-from physhandi.data.files import named_fields
 from physhandi.data.layout import MATERIAL_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.errors import MissingInputError, RunError, UsageError
+from physhandi.fitting.stored_take import keeps_springs
 from physhandi.object_rollout import ObjectRollout, load_fitted, load_surface
 from physhandi.progress import Progress, Watcher, watched
 from physhandi.settings import changes as changed_settings
@@ -502,11 +502,6 @@ class FittedObject:
             return latest
         self._simulator = Simulator(model, parameters, device=device)
         return self._simulator
-
-
-def keeps_springs(run: RunFolder) -> bool:
-    """Whether a run's object was edited before it was steered, so that its springs must stay."""
-    return bool((named_fields(run.config.get("take")) or {}).get("is_edited"))
 
 
 def _filled(rollout: ObjectRollout, simulator: Simulator) -> Iterator[Frame]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from app.jobs.catalog import Catalog, NotFoundError, RunItem
-from app.previews.worker import MOVING, NONE, SECONDS_EACH, STILL
+from app.previews.files import MOVING, NONE, SECONDS_EACH, STILL
 from app.settings import ServerSettings
 from physhandi.child import Child, ChildEndedError
 from physhandi.data.files import write_bytes

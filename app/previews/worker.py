@@ -11,15 +11,11 @@ from pathlib import Path
 import cv2
 
 from app.previews.clip import clip_of_run, clip_of_sequence
+from app.previews.files import MOVING, NONE, SECONDS_EACH, STILL
 from physhandi.child import Channel, run_child
 from physhandi.data.files import write_bytes
 from physhandi.errors import describe
 
-STILL, MOVING, NONE = ".still.webp", ".moving.webp", ".none"
-"""Endings of the two pictures, and of the note that says why there are none."""
-SECONDS_EACH = 60
-"""Processor time that one preview may take [s]; by the clock it may be many times as much, as
-everything else goes first."""
 _POLITENESS = 10
 
 

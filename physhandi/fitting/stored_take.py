@@ -59,3 +59,8 @@ class StoredTake:
             parameters = SimulationParameters.from_dict(about["parameters"])
             take = Take.from_tensors(read_tensors(run.folder / TAKE_FILE), parameters)
             return cls(take=take, sequence=str(about["sequence"]), frame=int(about["frame"]))
+
+
+def keeps_springs(run: RunFolder) -> bool:
+    """Whether a run's object was edited before it was steered, so that its springs must stay."""
+    return bool((named_fields(run.config.get("take")) or {}).get("is_edited"))

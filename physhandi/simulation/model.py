@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 from numpy import ndarray
 
 from physhandi.simulation.contact_intervals import acts_in, always
@@ -203,3 +203,22 @@ class SpringMassModel:
         for name in ("object_spring_count", "control_count"):
             values[name] = int(values[name][0])
         return cls(**values, rod=Rod.from_tensors(tensors))
+
+
+def checked_control(control: Float[ndarray, "frame control 3"], count: int) -> ndarray:
+    """Return a control trajectory as float32.
+
+    Args:
+        control: Positions of the control nodes in every frame [m].
+        count: Number of control nodes that there must be.
+
+    Raises:
+        ValueError: If it is of another shape or not finite.
+    """
+    control = np.asarray(control, dtype=np.float32)
+    if control.ndim != 3 or control.shape[1:] != (count, 3):
+        raise ValueError(f"control has shape {control.shape}; expected (frames, {count}, 3).")
+    bad = np.argwhere(~np.isfinite(control))
+    if len(bad):
+        raise ValueError(f"control is not finite at frame {bad[0][0]}, node {bad[0][1]}.")
+    return control

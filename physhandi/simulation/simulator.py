@@ -19,7 +19,7 @@ from physhandi.simulation.engines.rod_force import RodForce
 from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
-from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.model import SpringMassModel, checked_control
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import NodeState, Restart
 from physhandi.simulation.rod import Rod
@@ -434,22 +434,3 @@ def world_array(parameters: Sequence[SimulationParameters]) -> ndarray:
         for name, value in values.items():
             worlds[name][index] = value
     return worlds
-
-
-def checked_control(control: Float[ndarray, "frame control 3"], count: int) -> ndarray:
-    """Return a control trajectory as float32.
-
-    Args:
-        control: Positions of the control nodes in every frame [m].
-        count: Number of control nodes that there must be.
-
-    Raises:
-        ValueError: If it is of another shape or not finite.
-    """
-    control = np.asarray(control, dtype=np.float32)
-    if control.ndim != 3 or control.shape[1:] != (count, 3):
-        raise ValueError(f"control has shape {control.shape}; expected (frames, {count}, 3).")
-    bad = np.argwhere(~np.isfinite(control))
-    if len(bad):
-        raise ValueError(f"control is not finite at frame {bad[0][0]}, node {bad[0][1]}.")
-    return control

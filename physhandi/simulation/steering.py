@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
-from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -23,10 +22,9 @@ from physhandi.quaternions import without_jumps
 from physhandi.simulation.contact_intervals import always
 from physhandi.simulation.fingers import BENDS, CURLS, Fingers, curled
 from physhandi.simulation.forces import virtual_spring_forces
-from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.model import SpringMassModel, checked_control
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import NodeState, start_from_tensors, start_to_tensors
-from physhandi.simulation.simulator import Simulator, checked_control
 from physhandi.simulation.stability import stable_substeps
 from physhandi.simulation.topology import virtual_floor, virtual_springs
 
@@ -467,6 +465,8 @@ class Take:
         """
         if seconds <= 0.0:
             return self
+        from scipy.ndimage import gaussian_filter1d  # Takes long to import; servers rarely smooth.
+
         width = seconds * self.parameters.frame_rate
         count, hands = self.pose.shape[:2]
         turn = Rotation.from_rotvec(self.pose[..., 3:6].reshape(-1, 3)).as_quat()
@@ -591,6 +591,8 @@ class SteeredSimulation:
             take: Its model, control nodes and first poses.
             device: Warp device.
         """
+        from physhandi.simulation.simulator import Simulator  # Whoever shows a take runs no Warp.
+
         self._take = take
         self._simulator = Simulator(take.model, take.parameters, device=device)
         self._simulator.reset(*take.start)

@@ -199,14 +199,19 @@ def test_an_empty_server_tells_how_to_begin(tmp_path: Path) -> None:
 def test_a_server_and_what_annotates_start_without_what_only_fits_need() -> None:
     heavy = ["torch", "ai_edge_litert", "mujoco", "matplotlib"]
     # Every command waits for what the command line imports.
-    drawn = ["fastapi", "viser", "warp"]
+    served = ["fastapi", "viser"]
+    # Children simulate and draw; smoothing and splats are rare.
+    simulated = ["warp", "scipy.ndimage", "scipy.cluster"]
     code = f"""
 import sys
-sys.modules.update(dict.fromkeys({heavy + drawn!r}))
+sys.modules.update(dict.fromkeys({heavy + served + simulated!r}))
 import app.cli
-for name in {drawn!r}:
+for name in {served!r}:
     del sys.modules[name]
-import app.server, app.jobs.recordings.annotator
+import app.server
+for name in {simulated!r}:
+    del sys.modules[name]
+import app.jobs.recordings.annotator
 """
     root = Path(__file__).parents[2]
     done = subprocess.run(

@@ -65,6 +65,19 @@ def test_a_device_is_picked_by_name() -> None:
             pick_device("cuda")
 
 
+def test_the_cpu_is_picked_without_warp_where_nothing_else_is() -> None:
+    done = run(
+        "import sys\n"
+        "sys.modules['warp'] = None\n"
+        "from physhandi import devices\n"
+        "devices.has_cuda_driver = lambda: False\n"
+        "print(devices.pick_devices('all'), devices.pick_devices('auto'))\n"
+        "devices.has_cuda_driver = lambda: True\n"
+        "print(devices.pick_device('cpu'))\n"
+    )
+    assert (done.stdout, done.stderr) == ("('cpu',) ('cpu',)\ncpu\n", "")
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
 def test_all_means_every_gpu_and_each_has_a_card() -> None:

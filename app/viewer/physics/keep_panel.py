@@ -23,9 +23,8 @@ from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence_meta import SAFE_NAME
 from physhandi.errors import UsageError
-from physhandi.fitted_object import keeps_springs
 from physhandi.fitting.stored_edits import describe_edits, store_edits
-from physhandi.fitting.stored_take import StoredTake
+from physhandi.fitting.stored_take import StoredTake, keeps_springs
 from physhandi.run import Run
 from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import SimulationParameters, parameter_changes

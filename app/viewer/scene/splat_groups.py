@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from numpy import ndarray
-from scipy.cluster import vq as _vq
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +25,6 @@ _FEWEST = 8
 """Splats that a group has on average, unless it is one of `MOST_GROUPS`."""
 _SEED = 0
 _ROUNDS = 20
-_untyped: Any = _vq
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,10 +46,13 @@ class SplatGroups:
             splats: At least one splat.
             most: Most groups.
         """
+        from scipy.cluster import vq  # Few objects have splats, and all servers would import it.
+
+        untyped: Any = vq
         center = splats.center.astype(np.float64)
         count = max(min(most, len(center) // _FEWEST), 1)
         start = np.random.default_rng(_SEED)
-        group = _untyped.kmeans2(center, count, _ROUNDS, minit="++", rng=start)[1]
+        group = untyped.kmeans2(center, count, _ROUNDS, minit="++", rng=start)[1]
         # Of groups that became empty nothing is kept.
         _, group = np.unique(group, return_inverse=True)
         return cls(splats=splats, binding=SplatBinding.of(splats), group=group)

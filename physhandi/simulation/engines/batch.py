@@ -42,8 +42,9 @@ from physhandi.simulation.kernels.batch_losses import (
     sum_tracks,
 )
 from physhandi.simulation.master_topology import MasterTopology
+from physhandi.simulation.model import checked_control
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.simulator import SPEED_LIMIT, Simulator, checked_control
+from physhandi.simulation.simulator import SPEED_LIMIT, Simulator
 
 _BUSY_WARPS = 24
 """Warps that keep a multiprocessor busy."""
