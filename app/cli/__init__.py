@@ -2,18 +2,23 @@
 
 import logging
 import sys
+from typing import TYPE_CHECKING
 
-import tyro
-from tyro.extras import SubcommandApp
-
-from app.cli import benchmark, data_folder, recordings, runs, serving
-from app.cli.suite import evaluate_suite
 from physhandi.child import end_without_collecting
 from physhandi.errors import PhysHandiError, UsageError, describe
 
+if TYPE_CHECKING:
+    from tyro.extras import SubcommandApp
 
-def build() -> SubcommandApp:
+
+def build() -> "SubcommandApp":
     """Make the tree of commands; their docstrings and types are the help text."""
+    # Here, because processes of suites start in this package and need none of the commands.
+    from tyro.extras import SubcommandApp
+
+    from app.cli import benchmark, data_folder, recordings, runs, serving
+    from app.cli.suite import evaluate_suite
+
     imports = SubcommandApp()
     imports.command(name="capture")(recordings.import_capture)
     imports.command(name="stereo")(recordings.import_stereo)
@@ -62,10 +67,12 @@ def build() -> SubcommandApp:
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 failed with one clear line, 2 bad usage."""
+    from tyro.conf import OmitArgPrefixes
+
     end_without_collecting()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
-        code = build().cli(prog="physhandi", args=argv, config=(tyro.conf.OmitArgPrefixes,)) or 0
+        code = build().cli(prog="physhandi", args=argv, config=(OmitArgPrefixes,)) or 0
     except UsageError as error:
         print(f"physhandi: {error}", file=sys.stderr)
         code = 2

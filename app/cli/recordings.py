@@ -2,7 +2,7 @@
 
 import shutil
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -13,9 +13,11 @@ from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.fitting.checks.readiness import StageReadiness
-from physhandi.fitting.checks.recording_check import RecordingCheck, check_recording
 from physhandi.fitting.config import HANDS, OBSERVATION
 from physhandi.progress import watched
+
+if TYPE_CHECKING:
+    from physhandi.fitting.checks.recording_check import RecordingCheck
 
 
 def check(
@@ -29,6 +31,8 @@ def check(
     Args:
         sequences: Folders or names of sequences.
     """
+    from physhandi.fitting.checks.recording_check import RecordingCheck, check_recording
+
     if not sequences:
         raise UsageError("Name at least one sequence to check.")
     reports: dict[str, dict[str, Any]] = {}
@@ -66,7 +70,7 @@ def _use(stage: StageReadiness) -> str:
     return "can be reconstructed" if stage.is_ready else f"lacks {', '.join(stage.missing)}"
 
 
-def _told(found: RecordingCheck, *, as_json: bool) -> dict[str, Any]:
+def _told(found: "RecordingCheck", *, as_json: bool) -> dict[str, Any]:
     """Write what a check found for programs, or with a line for each stage and problem."""
     if as_json:
         return found.to_dict()

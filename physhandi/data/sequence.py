@@ -455,6 +455,11 @@ class Sequence:
         """Frames that are held out for scoring the prediction."""
         return range(self.meta.reconstruction_count, self.frame_count)
 
+    @property
+    def depth_views(self) -> list[View]:
+        """Views that tell where surfaces are and whose: those with depth and masks."""
+        return [view for view in self.views if view.has_depth and view.has_mask]
+
     @cached_property
     def held_out_views(self) -> tuple[View, ...]:
         """Views for scoring only, from ``truth/views/``; no stage of a fit reads them."""

@@ -48,7 +48,7 @@ def observe_object(sequence: Sequence, progress: Progress | None = None) -> Obje
     progress = progress or NullProgress()
     if sequence.marker is not None and sequence.marker_motion_valid is not None:
         return _from_surface_markers(sequence, progress)
-    views = depth_views(sequence)
+    views = sequence.depth_views
     if sequence.marker is None and not views:
         raise MissingInputError(_what_is_missing(sequence, "the object"))
     paths: list[list[ndarray]] = [[] for _ in views]
@@ -95,7 +95,7 @@ def hand_points(
         CancelledError: If the user asked to stop.
     """
     progress = progress or NullProgress()
-    views = depth_views(sequence)
+    views = sequence.depth_views
     if not views:
         raise MissingInputError(_what_is_missing(sequence, "the hands"))
     points: list[list[ndarray]] = [[] for _ in sequence.hands]
@@ -164,11 +164,6 @@ def fuse(parts: list[Float[ndarray, "_ 3"]]) -> Float[ndarray, "point 3"]:
     tree = KDTree(mean)
     company = tree.query_ball_point(mean, OUTLIER_RADIUS, return_length=True)
     return mean[company >= OUTLIER_COUNT].astype(np.float32)
-
-
-def depth_views(sequence: Sequence) -> list[View]:
-    """List the views that tell where surfaces are and whose: those with depth and masks."""
-    return [view for view in sequence.views if view.has_depth and view.has_mask]
 
 
 def _what_is_missing(sequence: Sequence, subject: str) -> str:

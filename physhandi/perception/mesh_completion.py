@@ -17,7 +17,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
 from physhandi.data.view import View
 from physhandi.errors import FitError, MissingInputError, UsageError
-from physhandi.perception.lifting import OBJECT_LABEL, VOXEL, depth_views, fuse, surface_points
+from physhandi.perception.lifting import OBJECT_LABEL, VOXEL, fuse, surface_points
 from physhandi.perception.mesh_alignment import Alignment, SeenSpace, align_mesh
 from physhandi.perception.object_points import (
     CALIBRATION_MARGIN,
@@ -91,7 +91,7 @@ def complete_shape(
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise UsageError(f"A scale of {scale} makes no sense; give metres for one unit.")
     sequence = Sequence.load(Path(folder))
-    views = depth_views(sequence)
+    views = sequence.depth_views
     cloud = _first_cloud(sequence, views)
     mesh = read_mesh(mesh_file)
     rotation, middle = (None, None) if pose is None else (pose.rotation, pose.middle)

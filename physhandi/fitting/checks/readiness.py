@@ -26,7 +26,6 @@ from physhandi.fitting.config import (
     PipelineConfig,
     planned_stages,
 )
-from physhandi.perception.lifting import depth_views
 
 HANDS_OR_CONTROL, COLOR_OR_KEYPOINT = "hands or control", "color or keypoint"
 DEPTH_WITH_MASK, NO_CONTROL = "depth and mask in one view", "hands without control"
@@ -140,9 +139,9 @@ def missing_for_hands(sequence: Sequence) -> list[str]:
 def missing_for_object(sequence: Sequence) -> list[str]:
     """Tell what a sequence lacks for an object: something that shows it, and that moves it."""
     missing = sequence.missing("object")
-    if not missing and sequence.missing("marker") and not depth_views(sequence):
+    if not missing and sequence.missing("marker") and not sequence.depth_views:
         missing = [DEPTH_WITH_MASK]
-    if not missing and not depth_views(sequence):
+    if not missing and not sequence.depth_views:
         # Markers show single points; only those that sample the surface tell the shape too.
         missing = sequence.missing("object_node") if sequence.missing("marker_motion_valid") else []
     missing = [HANDS_OR_CONTROL if part == "control" else part for part in missing]

@@ -28,7 +28,6 @@ from physhandi.fitting.config import HANDS, OBSERVATION, STAGES
 from physhandi.perception.lifting import (
     HAND_LABEL,
     OBJECT_LABEL,
-    depth_views,
     fuse,
     surface_points,
 )
@@ -140,7 +139,7 @@ def check_recording(
         if not is_seen:
             # Stage 1 then fails, and with it the run: nothing that follows is reached.
             stages = _stopped(STAGES, SEEN_HAND)
-    depth = depth_views(sequence)
+    depth = sequence.depth_views
     if depth:
         shown = _shown_pixels(sequence, depth, progress)
         warnings += _judge_masks(sequence, shown)
