@@ -124,7 +124,7 @@ class SequenceWriter:
             OSError: If the disk does not take it.
         """
         path = self._path(rel)
-        pixels = image[..., ::-1] if image.ndim == 3 else image
+        pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.shape[2:] == (3,) else image
         options = [] if compression is None else [cv2.IMWRITE_PNG_COMPRESSION, compression]
         is_encoded, code = cv2.imencode(path.suffix, np.ascontiguousarray(pixels), options)
         if not is_encoded:
@@ -158,7 +158,8 @@ class SequenceWriter:
         for name in (_ORIGIN, _CHECKPOINTS):
             (self._temporary / name).unlink(missing_ok=True)
         write_yaml(self._temporary / FILE, meta.to_dict())
-        Sequence.load(self._temporary).validate()
+        written = Sequence.load(self._temporary)
+        written.validate()
         self._check_target()
         replaced: Path | None = None
         if self.folder.exists():
@@ -168,7 +169,7 @@ class SequenceWriter:
         sync_folder(self.folder.parent)
         if replaced is not None:
             shutil.rmtree(replaced)
-        return Sequence.load(self.folder)
+        return Sequence(self.folder, written.meta)
 
     def _take_over(self) -> list[Any]:
         """Continue in the folder of a writer of the same origin that was stopped or killed."""

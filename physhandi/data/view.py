@@ -90,7 +90,7 @@ class View:
         else:
             image = self._image("color", frame, cv2.IMREAD_COLOR)
         self._check_size("color", frame, image)
-        return np.ascontiguousarray(image[..., ::-1])
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def depth(self, frame: int) -> Float[ndarray, "row column"]:
         """Read the depth image of a frame [m]; zero where nothing was measured."""

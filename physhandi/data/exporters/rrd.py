@@ -178,6 +178,6 @@ class _Recording:
         if np.any(camera.distortion):
             image = cv2.undistort(image, camera.K, camera.distortion)
         options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        _, content = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), options)
+        _, content = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
         jpeg = self._rerun.EncodedImage(contents=content.tobytes(), media_type="image/jpeg")
         self._log(f"/cameras/{view.name}/image", jpeg)

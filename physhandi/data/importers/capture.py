@@ -819,7 +819,7 @@ def _write_color(writer: SequenceWriter, source: _Source, frame: int) -> None:
         # What was lossy before stays as small as it was.
         writer.save_image(
             place + (".png" if is_png else ".jpg"),
-            np.ascontiguousarray(image[..., ::-1]),
+            cv2.cvtColor(image, cv2.COLOR_BGR2RGB),
             compression=_PNG_EFFORT if is_png else None,
         )
 
