@@ -17,13 +17,13 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from safetensors.numpy import save
 
+from physhandi.data.arrays import write_array
 from physhandi.data.checkpoint import FileCheckpointer, packed
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import (
     json_line,
     sweep_temporary,
     temporary_name,
-    write_array,
     write_atomically,
     write_bytes,
     write_json,

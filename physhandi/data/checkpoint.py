@@ -18,7 +18,8 @@ from numpy import ndarray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from physhandi.data.files import named_fields, read_tensors, write_bytes
+from physhandi.data.arrays import read_tensors
+from physhandi.data.files import named_fields, write_bytes
 from physhandi.data.run_folder import inside
 from physhandi.errors import RunError, describe
 

@@ -7,7 +7,6 @@ import os
 import secrets
 import shutil
 import socket
-import tokenize
 import zipfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,14 +14,9 @@ from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, ClassVar, cast
 
-import numpy as np
 import psutil
 import yaml
-from numpy.lib import format as npy
-from safetensors import numpy as safetensors_numpy
 
-_MAGIC = b"\x93NUMPY"
-_ODD = (tokenize.TokenError, SyntaxError, TypeError, KeyError, OverflowError, MemoryError)
 _FIRST_TIME = (1980, 1, 1, 0, 0, 0)
 """The earliest time that a ZIP archive can tell."""
 _HOST = socket.gethostname().replace("-", "_").replace(".", "_")[:32] or "host"
@@ -143,36 +137,22 @@ def zip_bytes(files: Iterable[tuple[str, bytes]]) -> bytes:
     return stream.getvalue()
 
 
-def write_array(path: Path, array: np.ndarray) -> None:
-    """Write an array as ``.npy``; arrays of Python objects are refused (ValueError)."""
-    contiguous = np.asarray(array, order="C")
-
-    def write(stream: BinaryIO) -> None:
-        # NumPy's own writer of files does not say that a disk is full, so it is given no file.
-        np.save(_Unlabelled(stream), contiguous, allow_pickle=False)
-
-    write_atomically(path, write)
-
-
-class _Unlabelled:
-    """Something that can be written to, and nothing else."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self.write = stream.write
-
-
 def plain(value: Any) -> Any:
     """Turn NumPy values, paths and tuples into lists, numbers and text, as JSON and YAML have."""
+    if value is None or type(value) in {str, int, float, bool}:
+        return value
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if value is None or isinstance(value, str | int | float | bool):
-        return value
     if isinstance(value, PurePath):
         return str(value)
     if isinstance(value, list | tuple | set | frozenset | range):
         return [plain(item) for item in cast("Iterable[Any]", value)]
+    import numpy as np  # The process that supervises a fit comes here with nothing of NumPy's.
+
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, str | int | float | bool):
+        return value
     raise TypeError(f"{type(value).__name__} cannot be stored in JSON or YAML")
 
 
@@ -202,51 +182,6 @@ def write_yaml(path: Path, value: Any) -> None:
     options = {"sort_keys": False, "allow_unicode": True, "width": 100}
     text: str = yaml.dump(plain(value), Dumper=_FastDumper, **options)
     write_bytes(path, text.encode())
-
-
-def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
-    """Read an ``.npy`` file without ever unpickling.
-
-    Args:
-        path: File to read.
-        mmap: Map the file instead of reading it; the array is read-only.
-
-    Raises:
-        ValueError: If the file is not a whole array of plain numbers.
-        FileNotFoundError: If there is no such file.
-    """
-    with path.open("rb") as stream:
-        start = stream.read(len(_MAGIC))
-    if start != _MAGIC:
-        kinds = {b"": "the file is empty", b"PK": "it is an archive, not one array"}
-        raise ValueError(kinds.get(start[:2], "it does not begin as one"))
-    try:
-        _check_announced(path)
-        mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
-    except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
-        raise ValueError(f"its header is damaged ({error})") from error
-    return mapped if mmap else np.array(mapped)
-
-
-def _check_announced(path: Path) -> None:
-    """Refuse an array whose header announces more than its file holds."""
-    with path.open("rb") as stream:
-        readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-        read = readers.get(npy.read_magic(stream))
-        if read is None:  # Names of fields that are not Latin, which NumPy judges itself.
-            return
-        shape, _, kind = read(stream)
-        announced, there = math.prod(shape) * kind.itemsize, path.stat().st_size - stream.tell()
-        if announced > there:
-            raise ValueError(
-                f"its header announces {shape} numbers of {kind}, {announced} bytes, but "
-                f"{there} follow"
-            )
-
-
-def read_tensors(path: Path) -> dict[str, np.ndarray]:
-    """Read a ``.safetensors`` file."""
-    return safetensors_numpy.load(path.read_bytes())
 
 
 def named_fields(value: Any) -> dict[str, Any] | None:

@@ -11,12 +11,11 @@ from typing import Any, Literal, TypeVar
 from numpy import ndarray
 from safetensors import SafetensorError
 
+from physhandi.data.arrays import read_array, read_tensors
 from physhandi.data.attempt import Attempt, prune
 from physhandi.data.files import (
     named_fields,
     plain,
-    read_array,
-    read_tensors,
     require_plain,
     temporary_name,
     write_bytes,

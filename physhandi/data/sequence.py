@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
-from physhandi.data.files import read_array
+from physhandi.data.arrays import read_array
 from physhandi.data.length_unit import (
     FARTHEST_POSITION,
     doubt_depth,

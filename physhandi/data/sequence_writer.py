@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Integer
 from numpy import ndarray
 
+from physhandi.data.arrays import write_array
 from physhandi.data.files import (
     is_abandoned,
     stopped_name,
     sweep_temporary,
     sync_folder,
     temporary_name,
-    write_array,
     write_yaml,
 )
 from physhandi.data.sequence import Sequence

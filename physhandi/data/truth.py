@@ -13,8 +13,9 @@ from typing import Any
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from physhandi.data.arrays import read_array
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.files import named_fields, parse_yaml, read_array
+from physhandi.data.files import named_fields, parse_yaml
 from physhandi.data.sequence_meta import Side
 from physhandi.data.view import View
 from physhandi.errors import SequenceError

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
+from physhandi.data.arrays import read_array
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.files import read_array
 from physhandi.data.untrusted.image_header import announced_size, check_pixels, video_size
 from physhandi.errors import SequenceError
 

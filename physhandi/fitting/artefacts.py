@@ -13,8 +13,9 @@ from numpy import ndarray
 from safetensors.numpy import load_file
 
 from physhandi.appearance.splats import Splats
+from physhandi.data.arrays import read_array
 from physhandi.data.attempt import Attempt
-from physhandi.data.files import named_fields, parse_yaml, read_array
+from physhandi.data.files import named_fields, parse_yaml
 from physhandi.data.layout import (
     MATERIAL_FILE,
     PARAMETERS_FILE,

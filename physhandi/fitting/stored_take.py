@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from physhandi.data.files import named_fields, read_tensors, write_bytes
+from physhandi.data.arrays import read_tensors
+from physhandi.data.files import named_fields, write_bytes
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.simulation.parameters import SimulationParameters

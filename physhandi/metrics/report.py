@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from physhandi.data.files import read_array, read_tensors
+from physhandi.data.arrays import read_array, read_tensors
 from physhandi.data.layout import PARAMETERS_FILE, REST_NODE_FILE, SequenceFiles
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth

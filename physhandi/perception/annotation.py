@@ -15,12 +15,12 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 import physhandi
+from physhandi.data.arrays import write_array
 from physhandi.data.files import (
     named_fields,
     sweep_temporary,
     sync_folder,
     temporary_name,
-    write_array,
     write_bytes,
     write_yaml,
 )

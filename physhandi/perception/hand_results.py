@@ -19,7 +19,8 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 import physhandi
-from physhandi.data.files import named_fields, write_array, write_yaml
+from physhandi.data.arrays import write_array
+from physhandi.data.files import named_fields, write_yaml
 from physhandi.data.length_unit import doubt_keypoints
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE

@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import physhandi
-from physhandi.data.files import write_array, write_yaml
+from physhandi.data.arrays import write_array
+from physhandi.data.files import write_yaml
 from physhandi.data.importers.mesh import read_mesh
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE

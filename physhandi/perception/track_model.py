@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from physhandi.child import Channel, Child, ChildEndedError, run_child
-from physhandi.data.files import read_array
+from physhandi.data.arrays import read_array
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import PhysHandiError, RunError, UsageError

@@ -1,6 +1,8 @@
 """When a process is taken to hang, what a kill is put down to, and who is started again."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -162,3 +164,20 @@ def test_each_damaged_field_of_a_ticket_is_as_in_a_new_one(tmp_path: Path) -> No
         expected = replace(ticket, **{name: getattr(Ticket(), name)})
         # Python takes true for 1.
         assert repr(read_ticket(tmp_path / QUEUED)) == repr(expected), name
+
+
+def test_supervising_a_run_loads_no_numpy(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "sys.modules['numpy'] = None\n"
+        "import app.jobs.supervise\n"
+        "from app.jobs.ticket import note_end, note_start\n"
+        "note_start(Path(sys.argv[1]), 'cpu')\n"
+        "note_end(Path(sys.argv[1]), 'It failed.')\n"
+    )
+    command = [sys.executable, "-c", code, str(run.folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert run.state == "failed"

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.interpolate import CubicSpline
 
-from physhandi.data.files import read_array
+from physhandi.data.arrays import read_array
 from physhandi.data.length_unit import doubt_extent, doubt_position
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 from numpy import ndarray
 
+from physhandi.data.arrays import read_array
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.files import read_array
 from physhandi.data.length_unit import FARTHEST_POSITION as FARTHEST
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.untrusted.image_header import announced_size, video_size

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.files import parse_yaml, read_array
+from physhandi.data.arrays import read_array
+from physhandi.data.files import parse_yaml
 from physhandi.data.importers.phystwin_files import fail
 from physhandi.data.length_unit import FARTHEST_POSITION
 

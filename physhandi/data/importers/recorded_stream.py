@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.files import read_array
+from physhandi.data.arrays import read_array
 from physhandi.data.importers.phystwin_files import fail, probe_video
 from physhandi.data.importers.recorded_camera import read_table
 from physhandi.data.untrusted.image_header import MOST_PIXELS, announced_size

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from physhandi.data.files import read_array
+from physhandi.data.arrays import read_array
 
 MOST_PIXELS = 50_000_000
 """Pixels of the largest image that is decoded: 8,192 x 6,144."""

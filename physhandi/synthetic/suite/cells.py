@@ -29,8 +29,9 @@ from physhandi.appearance.scoring import (
     rebound,
 )
 from physhandi.appearance.splats import Splats
+from physhandi.data.arrays import read_tensors, write_array
 from physhandi.data.environment import processor_name
-from physhandi.data.files import read_tensors, write_array, write_bytes, write_json
+from physhandi.data.files import write_bytes, write_json
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.lease import locked_file
 from physhandi.data.run import RunFolder

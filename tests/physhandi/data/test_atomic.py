@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from physhandi.data.arrays import read_array, write_array
 from physhandi.data.files import (
     is_abandoned,
     json_line,
     plain,
-    read_array,
     replacing,
     sweep_temporary,
     temporary_name,
-    write_array,
     write_atomically,
 )
 

@@ -18,7 +18,7 @@ from waiting import LIMIT_S
 from physhandi.data import attempt as attempt_module
 from physhandi.data import lease
 from physhandi.data import run as run_module
-from physhandi.data.files import write_array
+from physhandi.data.arrays import write_array
 from physhandi.data.run_folder import read_events
 from physhandi.errors import CancelledError, RunError
 from physhandi.progress import Preview, Progress

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from header_bombs import jpeg, mp4, png
 
+from physhandi.data.arrays import read_array
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.files import read_array
 from physhandi.data.untrusted.image_header import MOST_PIXELS, announced_size, video_size
 from physhandi.data.view import View
 from physhandi.errors import SequenceError

@@ -1,0 +1,78 @@
+"""Arrays in files: NumPy's own ``.npy``, and safetensors."""
+
+import math
+import tokenize
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.lib import format as npy
+from safetensors import numpy as safetensors_numpy
+
+from physhandi.data.files import write_atomically
+
+_MAGIC = b"\x93NUMPY"
+_ODD = (tokenize.TokenError, SyntaxError, TypeError, KeyError, OverflowError, MemoryError)
+
+
+def write_array(path: Path, array: np.ndarray) -> None:
+    """Write an array as ``.npy``; arrays of Python objects are refused (ValueError)."""
+    contiguous = np.asarray(array, order="C")
+
+    def write(stream: BinaryIO) -> None:
+        # NumPy's own writer of files does not say that a disk is full, so it is given no file.
+        np.save(_Unlabelled(stream), contiguous, allow_pickle=False)
+
+    write_atomically(path, write)
+
+
+class _Unlabelled:
+    """Something that can be written to, and nothing else."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.write = stream.write
+
+
+def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
+    """Read an ``.npy`` file without ever unpickling.
+
+    Args:
+        path: File to read.
+        mmap: Map the file instead of reading it; the array is read-only.
+
+    Raises:
+        ValueError: If the file is not a whole array of plain numbers.
+        FileNotFoundError: If there is no such file.
+    """
+    with path.open("rb") as stream:
+        start = stream.read(len(_MAGIC))
+    if start != _MAGIC:
+        kinds = {b"": "the file is empty", b"PK": "it is an archive, not one array"}
+        raise ValueError(kinds.get(start[:2], "it does not begin as one"))
+    try:
+        _check_announced(path)
+        mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
+    except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
+        raise ValueError(f"its header is damaged ({error})") from error
+    return mapped if mmap else np.array(mapped)
+
+
+def _check_announced(path: Path) -> None:
+    """Refuse an array whose header announces more than its file holds."""
+    with path.open("rb") as stream:
+        readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+        read = readers.get(npy.read_magic(stream))
+        if read is None:  # Names of fields that are not Latin, which NumPy judges itself.
+            return
+        shape, _, kind = read(stream)
+        announced, there = math.prod(shape) * kind.itemsize, path.stat().st_size - stream.tell()
+        if announced > there:
+            raise ValueError(
+                f"its header announces {shape} numbers of {kind}, {announced} bytes, but "
+                f"{there} follow"
+            )
+
+
+def read_tensors(path: Path) -> dict[str, np.ndarray]:
+    """Read a ``.safetensors`` file."""
+    return safetensors_numpy.load(path.read_bytes())
