@@ -5,6 +5,7 @@ arrays, has limits of memory and time, and hands back arrays (.npz) and a tree (
 """
 
 import encodings.cp437 as zip_text
+import gc
 import io
 import json
 import logging
@@ -629,6 +630,8 @@ def limit_data(most_bytes: int) -> None:
 def _work(channel: Channel) -> None:
     """Read the file that the arguments name."""
     source, out, seconds, most_bytes = channel.arguments
+    # Nothing is thrown away here; the collector would search a growing tree again and again.
+    gc.disable()
     limit(int(seconds), int(most_bytes))
     read(Path(source), Path(out), int(most_bytes))
 
