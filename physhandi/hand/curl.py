@@ -89,13 +89,14 @@ def curled_rotations(
     turn = turn + more[:, :, 1:].reshape(turn.shape)
     swing = np.zeros((len(turn), _BONES, 3))
     swing[:, 1::3] = more[:, :, :1] * joints.swing_axis
-    turned = [
-        Rotation.from_rotvec(sideways)
-        * now
-        * Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), its[:, None] * joints.axis]))
-        for sideways, its in zip(swing, turn, strict=True)
-    ]
-    return np.stack([each.as_quat() for each in turned])
+    about = np.zeros((len(turn), _BONES, 3))
+    about[:, 1:] = turn[:, :, None] * joints.axis
+    turned = (
+        Rotation.from_rotvec(swing.reshape(-1, 3))
+        * now[np.tile(np.arange(_BONES), len(turn))]
+        * Rotation.from_rotvec(about.reshape(-1, 3))
+    )
+    return turned.as_quat().reshape(len(turn), _BONES, 4)
 
 
 def curl_motion(
@@ -110,9 +111,12 @@ def curl_motion(
     Returns:
         Matrices that take points of a bone from where they are in the frame to where they go.
     """
-    still = curled_rotations(skin, side, frame, np.zeros(1))
-    moved = _placed(skin, frame, curled_rotations(skin, side, frame, amount, bend))
-    return moved @ np.linalg.inv(_placed(skin, frame, still)[0])
+    # The first sample is the hand as it is.
+    amount = np.concatenate([np.zeros(1), amount])
+    if bend is not None:
+        bend = np.concatenate([np.zeros((1, bend.shape[1])), bend])
+    placed = _placed(skin, frame, curled_rotations(skin, side, frame, amount, bend))
+    return placed[1:] @ np.linalg.inv(placed[0])
 
 
 def finger_joints(

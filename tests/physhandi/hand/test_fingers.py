@@ -21,6 +21,8 @@ from physhandi.simulation.fingers import BENDS, CURLS, FINGERS, Fingers
 TIPS = [4, 8, 12, 16, 20]
 CURL = 0.25
 """One of `CURLS`, where nothing is interpolated."""
+STEP = 1e-8
+"""Step of a difference quotient [rad]."""
 
 
 class Hand:
@@ -36,9 +38,14 @@ class Hand:
 
     def chained(self, curl: float, bend: np.ndarray) -> np.ndarray:
         """Where the 21 keypoints come, by bones that hang on each other."""
-        moved = curl_motion(self.skin, self.motion.side, self.frame, np.array([curl]), bend[None])
+        return self.all_chained(curl, bend[None])[0]
+
+    def all_chained(self, curl: float, bend: np.ndarray) -> np.ndarray:
+        """Where they come by each of several bends."""
+        amount = np.full(len(bend), curl)
+        moved = curl_motion(self.skin, self.motion.side, self.frame, amount, bend)
         bone = np.array(BONE_OF_KEYPOINT)[:, None]
-        return blended(moved, bone, np.ones((21, 1)), self.keypoint)[0]
+        return blended(moved, bone, np.ones((21, 1)), self.keypoint)
 
 
 @pytest.fixture(scope="module", params=["right", "left"])
@@ -163,14 +170,18 @@ def test_a_tip_goes_as_near_as_its_joints_let_it(hand: Hand, finger: int) -> Non
     for way in (along / np.linalg.norm(along), back, hand.keypoint[17] - hand.keypoint[5]):
         target = tip + 0.1 * way / np.linalg.norm(way)
 
-        def away(angles: np.ndarray, target: np.ndarray = target) -> float:
-            bend = np.zeros(BENDS)
-            bend[own] = angles
-            return 10.0 * float(np.linalg.norm(hand.chained(CURL, bend)[TIPS[finger]] - target))
+        def away(angles: np.ndarray, target: np.ndarray = target) -> tuple[float, np.ndarray]:
+            """Distance, ten times, and its difference quotients."""
+            bend = np.zeros((5, BENDS))
+            bend[:, own] = angles + STEP * np.eye(5, 4, -1)
+            tip = hand.all_chained(CURL, bend)[:, TIPS[finger]]
+            distance = 10.0 * np.linalg.norm(tip - target, axis=1)
+            return distance[0], (distance[1:] - distance[0]) / STEP
 
         bounds = list(zip(low[own], high[own], strict=True))
         starts = [np.zeros(4), rng.uniform(low[own], high[own])]
-        best = min(minimize(away, start, bounds=bounds, tol=1e-9).fun for start in starts) / 10.0
+        ends = [minimize(away, start, jac=True, bounds=bounds, tol=1e-9) for start in starts]
+        best = min(end.fun for end in ends) / 10.0
         found = hand.fingers.follow(finger, target, CURL, np.zeros(BENDS))
         distance = np.linalg.norm(hand.chained(CURL, found)[TIPS[finger]] - target)
         assert distance > 0.02
