@@ -1,6 +1,7 @@
 """A server inside the test's process, and a small finished run for it to show."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,23 @@ ORIGIN = f"http://{HOST}"
 
 @dataclass(frozen=True)
 class World:
-    """An application with all its parts."""
+    """The parts of a server, and the application, which is made when something asks for it."""
 
     settings: ServerSettings
     security: Security
     catalog: Catalog
     scheduler: Scheduler
     sessions: Sessions
-    app: FastAPI
+
+    @cached_property
+    def app(self) -> FastAPI:
+        return create_app(
+            self.settings,
+            security=self.security,
+            catalog=self.catalog,
+            scheduler=self.scheduler,
+            sessions=self.sessions,
+        )
 
     def client(self, **headers: str) -> TestClient:
         """A client that sends nothing but these headers by itself."""
@@ -60,10 +70,7 @@ def make_world(data_dir: Path, *, bundled: Path = BUNDLED, **changes: Any) -> Wo
     catalog = Catalog(settings, bundled=bundled)
     scheduler = Scheduler(settings, catalog, worker="job_worker")
     sessions = Sessions(settings, catalog)
-    app = create_app(
-        settings, security=security, catalog=catalog, scheduler=scheduler, sessions=sessions
-    )
-    return World(settings, security, catalog, scheduler, sessions, app)
+    return World(settings, security, catalog, scheduler, sessions)
 
 
 def tiny_config() -> PipelineConfig:

@@ -12,7 +12,6 @@ from server_world import HOST, ORIGIN, TOKEN, World, make_world
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from app.security import Security
-from app.server import create_app
 
 ONLY = "a-token-for-people-who-only-look"
 LOOKING = {
@@ -37,15 +36,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     (data / "read_only").chmod(0o600)
     world = make_world(data, bundled=data / "nothing")
     settings = world.settings.model_copy(update={"read_only_token_file": data / "read_only"})
-    security = Security(settings)
-    app = create_app(
-        settings,
-        security=security,
-        catalog=world.catalog,
-        scheduler=world.scheduler,
-        sessions=world.sessions,
-    )
-    yield replace(world, settings=settings, security=security, app=app)
+    yield replace(world, settings=settings, security=Security(settings))
     world.sessions.shutdown()
 
 

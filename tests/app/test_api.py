@@ -18,8 +18,8 @@ from physhandi.run import Run
 
 
 @pytest.fixture
-def client(world: World) -> TestClient:
-    return world.script()
+def client(still_world: World) -> TestClient:
+    return still_world.script()
 
 
 def bundled_run(client: TestClient) -> str:
@@ -203,7 +203,8 @@ def test_what_cannot_be_exported_is_told(still_world: World, query: str) -> None
     assert error_of(response)["message"]
 
 
-def test_an_unfinished_run_has_nothing_to_export(client: TestClient) -> None:
+def test_an_unfinished_run_has_nothing_to_export(world: World) -> None:
+    client = world.script()
     run_id = client.post("/api/v1/runs", json={"sequences": ["sheet"]}).json()["id"]
     response = client.get(f"/api/v1/runs/{run_id}/export?format=npz")
     assert response.status_code == 409

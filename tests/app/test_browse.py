@@ -140,8 +140,8 @@ def test_nested_fields_are_named_by_their_path() -> None:
     assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "d": [1]}
 
 
-def test_the_list_says_what_it_shows_and_every_column_sorts_by_a_link(world: World) -> None:
-    client = world.browser()
+def test_the_list_says_what_it_shows_and_every_column_sorts_by_a_link(still_world: World) -> None:
+    client = still_world.browser()
     page = client.get("/runs?q=sheet&sort=-created").text
     assert '<tr class="plays" data-run="fitted"' in page
     assert "towel_fold_quick" not in page.partition('id="runs"')[2]
@@ -160,7 +160,9 @@ def test_the_list_says_what_it_shows_and_every_column_sorts_by_a_link(world: Wor
         again = client.get(address.replace("&amp;", "&"))
         assert again.status_code == 200
         assert 'data-run="fitted"' in again.text
-    finished = [run for run in world.catalog.runs() if world.scheduler.view(run).is_published]
+    finished = [
+        run for run in still_world.catalog.runs() if still_world.scheduler.view(run).is_published
+    ]
     assert f'value="succeeded" >succeeded ({len(finished)})' in page
     headers = client.get("/runs?q=&state=&sort=name", headers={"HX-Trigger": "filter"}).headers
     assert headers["HX-Replace-Url"] == "runs?sort=name"
@@ -169,8 +171,8 @@ def test_the_list_says_what_it_shows_and_every_column_sorts_by_a_link(world: Wor
     assert not {"hx-push-url", "hx-replace-url"} & set(quiet)
 
 
-def test_the_home_page_opens_what_came_with_it_and_says_whose_it_is(world: World) -> None:
-    page = world.browser().get("/").text
+def test_the_home_page_opens_what_came_with_it_and_says_whose_it_is(still_world: World) -> None:
+    page = still_world.browser().get("/").text
     opened = re.findall(r'<button class="([^"]+)" data-open="run" data-id="([^"]+)"', page)
     hero = [(name, run) for name, run in opened if run != "fitted"][:2]
     # Physics can be changed where there is an object, so that one comes first.
@@ -178,20 +180,20 @@ def test_the_home_page_opens_what_came_with_it_and_says_whose_it_is(world: World
     card = page.partition('data-sequence="stereo_hand"')[2].partition("</article>")[0]
     assert "TemugeB/handpose3d" in card
     assert "MIT" in card
-    told = world.script().get("/api/v1/sequences").json()["sequences"]
+    told = still_world.script().get("/api/v1/sequences").json()["sequences"]
     licences = {entry["id"]: entry["licence"] for entry in told if entry["is_bundled"]}
     assert licences == {"stereo_hand": "MIT, see LICENSE", "towel_fold": "Apache-2.0"}
-    runs = world.script().get("/api/v1/runs").json()["runs"]
+    runs = still_world.script().get("/api/v1/runs").json()["runs"]
     assert {run["id"]: run["has_object"] for run in runs} == {
         "fitted": True,
         "stereo_hand_default": False,
         "towel_fold_quick": True,
     }
-    of_hand = world.browser().get("/runs/stereo_hand_default").text
+    of_hand = still_world.browser().get("/runs/stereo_hand_default").text
     assert "<dd>1.52 px</dd>" in of_hand
     assert "format=mjcf" not in of_hand
     assert "format=newton" not in of_hand
-    of_towel = world.browser().get("/runs/towel_fold_quick").text
+    of_towel = still_world.browser().get("/runs/towel_fold_quick").text
     assert "format=mjcf" in of_towel
     assert "format=newton" in of_towel
 
@@ -213,13 +215,13 @@ def test_an_empty_list_says_why(still_world: World, query: str, text: str) -> No
     assert "<img src=x" not in page.text
 
 
-def test_a_wrong_address_of_a_list_is_told(world: World) -> None:
+def test_a_wrong_address_of_a_list_is_told(still_world: World) -> None:
     for wrong in ("/runs?sort=size", "/runs?limit=0", "/diff?run=a%2Fb&run=c", "/diff?show=some"):
-        assert world.browser().get(wrong).status_code == 422
+        assert still_world.browser().get(wrong).status_code == 422
 
 
-def test_sequences_are_filtered_and_lead_to_their_runs(world: World) -> None:
-    client = world.browser()
+def test_sequences_are_filtered_and_lead_to_their_runs(still_world: World) -> None:
+    client = still_world.browser()
     page = client.get("/sequences?q=marker%20control").text
     assert 'data-sequence="sheet"' in page
     assert "towel_fold" not in page.partition('id="sequences"')[2].partition("<dialog")[0]
@@ -229,8 +231,8 @@ def test_sequences_are_filtered_and_lead_to_their_runs(world: World) -> None:
     assert "No sequence fits this filter" in client.get("/sequences?q=nothing").text
 
 
-def test_two_runs_are_compared_by_their_address(world: World) -> None:
-    client = world.browser()
+def test_two_runs_are_compared_by_their_address(still_world: World) -> None:
+    client = still_world.browser()
     address = "/diff?run=fitted&run=towel_fold_quick"
     page = client.get(address).text
     assert "2 runs compared" in page

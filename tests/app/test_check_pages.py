@@ -39,14 +39,21 @@ def browser(world: World) -> TestClient:
     return world.browser()
 
 
+@pytest.fixture(scope="module")
+def still_browser(still_world: World, film: Path) -> TestClient:
+    """A browser of a server that stays as it is."""
+    shutil.copytree(film, still_world.settings.sequence_dir / "filmed")
+    return still_world.browser()
+
+
 def picture(content: bytes) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     return image[..., ::-1].astype(int)
 
 
-def test_the_page_shows_views_layers_and_stages_at_once(browser: TestClient) -> None:
-    page = browser.get("/sequences/filmed/check?frame=2")
+def test_the_page_shows_views_layers_and_stages_at_once(still_browser: TestClient) -> None:
+    page = still_browser.get("/sequences/filmed/check?frame=2")
     assert page.status_code == 200
     text = page.text
     assert 'data-view="front"' in text
@@ -54,16 +61,16 @@ def test_the_page_shows_views_layers_and_stages_at_once(browser: TestClient) -> 
     assert re.findall(r'name="layer" value="(\w+)"', text) == ["mask", "keypoint", "track"]
     assert "Reading every file" in text
     assert text.count("will run") == len(STAGES)
-    assert 'href="sequences/filmed/check"' in browser.get("/sequences").text
-    assert browser.get("/sequences/nowhere/check").status_code == 404
+    assert 'href="sequences/filmed/check"' in still_browser.get("/sequences").text
+    assert still_browser.get("/sequences/nowhere/check").status_code == 404
     # A recording of markers has no views, but stages.
-    markers = browser.get("/sequences/sheet/check").text
+    markers = still_browser.get("/sequences/sheet/check").text
     assert 'id="frames"' not in markers
     assert "Has nothing to do" in markers
 
 
-def test_a_frame_is_drawn_with_the_layers_that_are_asked_for(browser: TestClient) -> None:
-    answer = browser.get(f"{FRAME}/1")
+def test_a_frame_is_drawn_with_the_layers_that_are_asked_for(still_browser: TestClient) -> None:
+    answer = still_browser.get(f"{FRAME}/1")
     assert answer.headers["content-type"] == "image/jpeg"
     assert answer.headers["cache-control"] == "no-store"
     plain = picture(answer.content)
@@ -71,7 +78,8 @@ def test_a_frame_is_drawn_with_the_layers_that_are_asked_for(browser: TestClient
     scale = WIDTH / 48
 
     def drawn(layers: str) -> np.ndarray:
-        return np.abs(picture(browser.get(f"{FRAME}/1?layers={layers}").content) - plain).max(-1)
+        shown = picture(still_browser.get(f"{FRAME}/1?layers={layers}").content)
+        return np.abs(shown - plain).max(-1)
 
     def at(change: np.ndarray, x: float, y: float) -> int:
         return int(change[int((y + 0.5) * scale), int((x + 0.5) * scale)])
@@ -87,7 +95,7 @@ def test_a_frame_is_drawn_with_the_layers_that_are_asked_for(browser: TestClient
     assert at(tracked, 44, 30) > 40
     assert at(tracked, 20, 18) < 8
     assert drawn("mask,keypoint,track").max() > 40
-    depth = picture(browser.get(f"{FRAME}/1?depth=true").content)
+    depth = picture(still_browser.get(f"{FRAME}/1?depth=true").content)
     near, far = depth[int(18.5 * scale), int(20.5 * scale)], depth[5, 5]
     assert near.min() > far.max() + 100
 
@@ -120,8 +128,8 @@ def test_a_drawn_frame_is_kept_as_long_as_the_recording_stays(
         "/sequences/nowhere/views/front/frames/0",
     ],
 )
-def test_a_frame_that_is_not_there_is_not_found(browser: TestClient, address: str) -> None:
-    assert browser.get(address).status_code == 404
+def test_a_frame_that_is_not_there_is_not_found(still_browser: TestClient, address: str) -> None:
+    assert still_browser.get(address).status_code == 404
 
 
 def test_problems_are_listed_with_their_frames(browser: TestClient, world: World) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from queue_world import HOSTILE, QueueWorld, queue_world
+from server_world import World
 from waiting import until
 
 from app import api
@@ -97,23 +98,24 @@ def test_a_fit_is_cancelled_and_resumed(world: QueueWorld) -> None:
     ],
 )
 def test_a_wrong_order_is_refused_by_field_and_makes_no_run(
-    world: QueueWorld, body: Any, where: str
+    still_world: World, body: Any, where: str
 ) -> None:
-    response = world.client.post("/api/v1/runs", json=body)
+    response = still_world.script().post("/api/v1/runs", json=body)
     assert response.status_code == 422
     assert where in response.json()["error"]["message"]
-    assert list((world.data_dir / "runs").iterdir()) == []
+    assert [run.name for run in still_world.settings.run_dir.iterdir()] == ["fitted"]
 
 
-def test_unknown_ids_are_not_found(world: QueueWorld) -> None:
+def test_unknown_ids_are_not_found(still_world: World) -> None:
+    client = still_world.script()
     for path in ("runs/x", "sequences/x", "runs/x/losses", "runs/x/export?format=csv"):
-        response = world.client.get(f"/api/v1/{path}")
+        response = client.get(f"/api/v1/{path}")
         assert response.status_code == 404
         assert response.json()["error"]["code"] == "not_found"
-    assert world.client.post("/api/v1/runs/x/cancel").status_code == 404
+    assert client.post("/api/v1/runs/x/cancel").status_code == 404
     body = {"sequences": ["nowhere"], "profile": "quick"}
-    assert world.client.post("/api/v1/runs", json=body).status_code == 404
-    assert world.client.get("/sequences/sheet/thumbnail").status_code == 404
+    assert client.post("/api/v1/runs", json=body).status_code == 404
+    assert client.get("/sequences/sheet/thumbnail").status_code == 404
 
 
 def test_a_page_shows_results_with_units_and_its_parts_alone(world: QueueWorld) -> None:

@@ -95,8 +95,8 @@ def test_another_site_can_neither_launch_nor_cancel(world: World) -> None:
     assert [item.id for item in world.catalog.runs() if not item.is_bundled] == ["fitted"]
 
 
-def test_pages_run_no_foreign_and_no_inline_script(world: World) -> None:
-    client = world.browser()
+def test_pages_run_no_foreign_and_no_inline_script(still_world: World) -> None:
+    client = still_world.browser()
     for path in ("/", "/runs/fitted", "/nothing"):
         response = client.get(path)
         assert response.headers["content-security-policy"] == PAGE_POLICY
@@ -132,28 +132,28 @@ def test_no_path_leads_out(still_world: World, path: str) -> None:
     assert "root:" not in response.text
 
 
-def test_errors_are_pages_for_browsers_and_json_for_scripts(world: World) -> None:
-    page = world.browser().get("/runs/nothing")
+def test_errors_are_pages_for_browsers_and_json_for_scripts(still_world: World) -> None:
+    page = still_world.browser().get("/runs/nothing")
     assert (page.status_code, page.headers["content-type"]) == (404, "text/html; charset=utf-8")
     assert "There is no run &#39;nothing&#39;." in page.text
-    for client in (world.script(), world.browser()):
+    for client in (still_world.script(), still_world.browser()):
         answer = client.get("/api/v1/runs/nothing")
         assert answer.status_code == 404
         error = {"code": "not_found", "message": "There is no run 'nothing'."}
         assert answer.json() == {"error": error}
-    assert world.script().get("/nothing").json()["error"]["code"] == "not_found"
-    wrong = world.script().put("/api/v1/runs")
+    assert still_world.script().get("/nothing").json()["error"]["code"] == "not_found"
+    wrong = still_world.script().put("/api/v1/runs")
     assert (wrong.status_code, wrong.json()["error"]["code"]) == (405, "wrong_method")
 
 
 def test_a_defect_is_logged_and_told_without_details(
-    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    still_world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def break_down() -> None:
         raise ZeroDivisionError("secret detail")
 
-    monkeypatch.setattr(world.catalog, "sequences", break_down)
-    client = world.script()
+    monkeypatch.setattr(still_world.catalog, "sequences", break_down)
+    client = still_world.script()
     client._transport.raise_server_exceptions = False
     response = client.get("/api/v1/sequences")
     assert response.status_code == 500
@@ -162,10 +162,10 @@ def test_a_defect_is_logged_and_told_without_details(
     assert "secret detail" in caplog.text
 
 
-def test_a_large_body_is_refused(world: World) -> None:
+def test_a_large_body_is_refused(still_world: World) -> None:
     body = {"sequences": ["sheet"], "name": "x" * 2**20}
-    assert world.script().post("/api/v1/runs", json=body).status_code == 413
-    assert [item.id for item in world.catalog.runs() if not item.is_bundled] == ["fitted"]
+    assert still_world.script().post("/api/v1/runs", json=body).status_code == 413
+    assert [item.id for item in still_world.catalog.runs() if not item.is_bundled] == ["fitted"]
 
 
 def test_a_second_server_on_the_same_data_folder_says_so(world: World) -> None:

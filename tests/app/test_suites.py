@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,13 @@ def suite_folder(tmp_path_factory: pytest.TempPathFactory, sheet_folder: Path) -
     order = Order(title="A <b>sheet</b>", recordings=recordings, methods=METHODS, settings=settings)
     assert evaluate_suite(order, folder)["failed"] == 1
     return folder
+
+
+@pytest.fixture
+def world(still_world: World) -> Iterator[World]:
+    """One server for all tests: these write nothing but suites, which are removed."""
+    yield still_world
+    shutil.rmtree(still_world.settings.suite_dir, ignore_errors=True)
 
 
 @pytest.fixture

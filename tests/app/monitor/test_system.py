@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fastapi.testclient import TestClient
 from queue_world import HOSTILE, QueueWorld, serving
+from server_world import World
 from waiting import LIMIT_S, until
 
 from physhandi.data.attempt import PREVIEW, PreviewFile
@@ -49,8 +49,8 @@ def events(port: int, token: str, path: str) -> Iterator[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize("path", ROUTES)
-def test_nobody_without_the_token_learns_anything(world: QueueWorld, path: str) -> None:
-    stranger = TestClient(world.app, "http://127.0.0.1:8080")
+def test_nobody_without_the_token_learns_anything(still_world: World, path: str) -> None:
+    stranger = still_world.client()
     assert stranger.get(path).status_code == 401
     checked = stranger.post("/api/v1/runs/check", json={"sequences": ["sheet"]})
     assert checked.status_code == 401
