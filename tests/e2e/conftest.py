@@ -2,6 +2,7 @@
 
 import io
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -103,8 +104,16 @@ def _leads_out(url: str) -> bool:
 
 
 @contextmanager
-def _serving(folder: Path) -> Iterator[Served]:
-    """Start the program in a folder as a user does, and end it with the fits that it began."""
+def _serving(folder: Path, pictures: Path) -> Iterator[Served]:
+    """Start the program in a folder as a user does, and end it with the fits that it began.
+
+    Args:
+        folder: Where it runs.
+        pictures: Folder of small pictures that servers before it have drawn; what comes with the
+            program it need not draw again. It leaves its own there.
+    """
+    drawn = folder / "data" / "cache" / "previews"
+    shutil.copytree(pictures, drawn)
     # Users start it where they work, and often have a package of this name there.
     (folder / "app").mkdir()
     (folder / "app" / "__init__.py").write_text("raise SystemExit('a package of the user')")
@@ -135,18 +144,26 @@ def _serving(folder: Path) -> Iterator[Served]:
         finally:
             server.kill()
             server.wait()
+            for picture in drawn.glob("[!.]*.webp"):  # Hidden ones are half written.
+                shutil.copy2(picture, pictures)
 
 
 @pytest.fixture(scope="package")
-def _shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with _serving(tmp_path_factory.mktemp("shared_server")) as served:
+def _pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small pictures that servers of these tests have drawn."""
+    return tmp_path_factory.mktemp("pictures")
+
+
+@pytest.fixture(scope="package")
+def _shared_server(tmp_path_factory: pytest.TempPathFactory, _pictures: Path) -> Iterator[Served]:
+    with _serving(tmp_path_factory.mktemp("shared_server"), _pictures) as served:
         yield served
 
 
 @pytest.fixture(scope="module")
-def own_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def own_server(tmp_path_factory: pytest.TempPathFactory, _pictures: Path) -> Iterator[Served]:
     """A server for one file, for tests that look at everything that a server has."""
-    with _serving(tmp_path_factory.mktemp("own_server")) as served:
+    with _serving(tmp_path_factory.mktemp("own_server"), _pictures) as served:
         yield served
 
 
