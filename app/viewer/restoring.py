@@ -6,8 +6,7 @@ from app.viewer.content.camera_path import CameraPath
 from app.viewer.content.content import Content
 from app.viewer.content.layers import default_layers
 from app.viewer.content.session_state import SessionState
-from app.viewer.scene.cameras import pose_of_view
-from app.viewer.scene.framing import frame_content
+from app.viewer.scene.framing import frame_content, pose_of_view
 from physhandi.errors import UsageError
 
 

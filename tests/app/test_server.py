@@ -199,16 +199,18 @@ def test_an_empty_server_tells_how_to_begin(tmp_path: Path) -> None:
 def test_a_server_and_what_annotates_start_without_what_only_fits_need() -> None:
     heavy = ["torch", "ai_edge_litert", "mujoco", "matplotlib"]
     # Every command waits for what the command line imports, and processes of suites for theirs.
-    commands, served = ["tyro", "pydantic"], ["fastapi", "viser", "scipy"]
-    # Children simulate and draw; smoothing and splats are rare.
+    commands, served = ["tyro", "pydantic"], ["fastapi", "viser"]
+    # Children simulate and draw; smoothing and splats are rare. What makes files shows nothing.
     simulated = ["warp", "scipy.ndimage", "scipy.cluster"]
     code = f"""
 import sys
-sys.modules.update(dict.fromkeys({heavy + commands + served + simulated!r}))
+sys.modules.update(dict.fromkeys({heavy + commands + served + simulated + ["scipy"]!r}))
 import app.cli.suite_processes
 for name in {commands!r}:
     del sys.modules[name]
 app.cli.build()
+del sys.modules["scipy"]
+import app.exports.making
 for name in {served!r}:
     del sys.modules[name]
 import app.server

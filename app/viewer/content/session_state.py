@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import viser
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -13,6 +12,9 @@ from app.viewer.content.layers import Layers, Theme
 from physhandi.data.camera import PinholeCamera
 from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import SimulationParameters
+
+if TYPE_CHECKING:
+    import viser  # Files are made by processes that show nothing.
 
 Kind = Literal["run", "sequence", "comparison"]
 
@@ -56,7 +58,7 @@ class Pose:
     """Vertical field of view [rad]."""
 
     @classmethod
-    def of(cls, camera: viser.CameraHandle) -> "Pose":
+    def of(cls, camera: "viser.CameraHandle") -> "Pose":
         """Read a client's camera."""
         return cls(
             position=camera.position.copy(),
@@ -66,7 +68,7 @@ class Pose:
         )
 
     @classmethod
-    def first(cls, camera: viser.InitialCameraConfig) -> "Pose":
+    def first(cls, camera: "viser.InitialCameraConfig") -> "Pose":
         """Read where the cameras of new clients are put."""
         up = np.array([0.0, 0.0, 1.0]) if camera.up is None else camera.up
         return cls(position=camera.position, look_at=camera.look_at, up=up, fov=camera.fov)
@@ -83,14 +85,14 @@ class Pose:
         K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
         return PinholeCamera(K=K, T_world_camera=pose, width=width, height=height)
 
-    def give(self, client: viser.ClientHandle) -> None:
+    def give(self, client: "viser.ClientHandle") -> None:
         """Put a client's camera here."""
         camera = client.camera
         with client.atomic():
             camera.fov, camera.up_direction = self.fov, self.up
             camera.position, camera.look_at = self.position, self.look_at
 
-    def give_first(self, camera: viser.InitialCameraConfig) -> None:
+    def give_first(self, camera: "viser.InitialCameraConfig") -> None:
         """Put the cameras of new clients here."""
         camera.fov, camera.up = self.fov, self.up
         camera.position, camera.look_at = self.position, self.look_at

@@ -2,10 +2,9 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import viser
 import yaml
 
 from app.viewer.content.content import Content
@@ -19,6 +18,9 @@ from physhandi.data.object_mass import ObjectMass, given_mass
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
+
+if TYPE_CHECKING:
+    import viser  # Files are made by processes that show nothing.
 
 _MEAN_COLUMNS = "frame", "time_s", "mean_x", "mean_y", "mean_z", "force_x", "force_y", "force_z"
 _COMPARISON_COLUMNS = (
@@ -41,7 +43,7 @@ class Snapshot:
     """Frame of the rollout."""
     compared: Mapping[str, tuple[ObjectRollout, int]] | None = None
     """Rollouts of a comparison by the names of its sides, each with its frame; None outside."""
-    picture: Callable[[viser.ClientHandle], dict[str, Any]] | None = None
+    picture: "Callable[[viser.ClientHandle], dict[str, Any]] | None" = None
     """Finds another camera than the client's for a picture; None if the client's will do."""
     run: Run | None = None
     """The run, if it is one that is shown."""

@@ -15,7 +15,6 @@ import viser.transforms
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from app.viewer.content.session_state import Pose
 from app.viewer.scene.framing import Framing
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.view import View
@@ -157,21 +156,3 @@ class Lens:
         return np.asarray(
             cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         )
-
-
-def pose_of_view(view: View, framing: Framing) -> Pose:
-    """Stand where a view's camera stood, looking its way, with its field of view.
-
-    Args:
-        view: The view.
-        framing: Tells how far away the middle of the scene is, about which the camera turns.
-    """
-    camera = view.camera
-    _, down, ahead, origin = camera.T_world_camera[:3].T
-    distance = max(float((framing.center - origin) @ ahead), 0.1 * framing.extent)
-    return Pose(
-        position=origin,
-        look_at=origin + distance * ahead,
-        up=-down,
-        fov=float(2 * np.arctan2(camera.height / 2, camera.K[1, 1])),
-    )

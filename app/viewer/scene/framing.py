@@ -7,6 +7,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.content.content import Content
+from app.viewer.content.session_state import Pose
+from physhandi.data.view import View
 
 _SAMPLED_FRAMES = 12
 _SAMPLED_POINTS = 2_000
@@ -153,3 +155,21 @@ def _spacing(content: Content, extent: float) -> float:
         least = min(max(1.0 / model.node_count, 0.006), 0.025)
         return min(max(short, least * extent), 0.05 * extent)
     return 0.012 * extent
+
+
+def pose_of_view(view: View, framing: Framing) -> Pose:
+    """Stand where a view's camera stood, looking its way, with its field of view.
+
+    Args:
+        view: The view.
+        framing: Tells how far away the middle of the scene is, about which the camera turns.
+    """
+    camera = view.camera
+    _, down, ahead, origin = camera.T_world_camera[:3].T
+    distance = max(float((framing.center - origin) @ ahead), 0.1 * framing.extent)
+    return Pose(
+        position=origin,
+        look_at=origin + distance * ahead,
+        up=-down,
+        fov=float(2 * np.arctan2(camera.height / 2, camera.K[1, 1])),
+    )

@@ -25,8 +25,7 @@ from app.viewer.content.layers import (
     Theme,
     next_form,
 )
-from app.viewer.scene.cameras import pose_of_view
-from app.viewer.scene.framing import Framing
+from app.viewer.scene.framing import Framing, pose_of_view
 from app.viewer.scene.scene import grid_cell
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind

@@ -21,8 +21,8 @@ from app.viewer.content.layers import (
     with_surface_for_splats,
 )
 from app.viewer.content.observed import BONES
-from app.viewer.scene.cameras import BACKDROP_BYTES, CameraNodes, pose_of_view
-from app.viewer.scene.framing import Framing
+from app.viewer.scene.cameras import BACKDROP_BYTES, CameraNodes
+from app.viewer.scene.framing import Framing, pose_of_view
 from app.viewer.scene.nodes import SceneNodes
 from app.viewer.scene.object_drawing import (
     Budget,
