@@ -1,4 +1,4 @@
-"""What is known of previews by the server and the process that draws them: endings, and a limit."""
+"""File endings and the time limit of previews, shared by the server and what draws them."""
 
 STILL, MOVING, NONE = ".still.webp", ".moving.webp", ".none"
 """Endings of the two pictures, and of the note that says why there are none."""
