@@ -1,6 +1,7 @@
 """A painted disc that slides over a painted table, filmed by two cameras: every mask is known."""
 
 import itertools
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -77,10 +78,10 @@ def _paint(place: np.ndarray, low: tuple[int, ...], high: tuple[int, ...]) -> np
     return np.asarray(low) * (1 - share) + np.asarray(high) * share
 
 
-def picture(
-    camera: PinholeCamera, frame: int, *, hand: bool, top: float = TOP
-) -> tuple[np.ndarray, ...]:
+@cache  # Many tests write the same recording.
+def picture(view: str, frame: int, *, hand: bool, top: float) -> tuple[np.ndarray, ...]:
     """Draw color, depth [mm] and labels of a frame; the disc's face is at the height `top`."""
+    camera = cameras()[view]
     row, column = np.mgrid[:HEIGHT, :WIDTH].astype(float)
     pixel = np.stack([column, row], axis=-1)
     eye = camera.T_world_camera[:3, 3]
@@ -118,7 +119,7 @@ def write_disc(
     arrays: dict[str, np.ndarray] = {}
     labels: dict[str, np.ndarray] = {}
     for name, camera in cameras().items():
-        drawn = [picture(camera, frame, hand=hand, top=top) for frame in range(frames)]
+        drawn = [picture(name, frame, hand=hand, top=top) for frame in range(frames)]
         labels[name] = np.stack([label for _, _, label in drawn])
         for frame, (color, depth, label) in enumerate(drawn):
             images[f"views/{name}/color/{frame:05d}.png"] = color
