@@ -206,16 +206,21 @@ def contact_scores(
 
 
 def predicted_contacts(
-    reference: ContactReference, node: Float[ndarray, "frame node 3"], threshold: float
+    reference: ContactReference, distance: Float[ndarray, "frame node"], threshold: float
 ) -> Bool[ndarray, "frame node"]:
     """Predict contact where a virtual spring ends and the hand is nearer than the threshold.
 
     In frame 0 the springs alone decide: they are the contacts that the model found there.
+
+    Args:
+        reference: Where springs end.
+        distance: Distance of each node from the hands, see `hand_distance` [m].
+        threshold: Distance below which it counts [m].
     """
-    is_near = hand_distance(node, reference.hand[: len(node)]) < threshold
+    is_near = distance < threshold
     is_near[0] = True
     joined = reference.is_joined
-    return (joined if len(joined) == 1 else joined[: len(node)]) & is_near
+    return (joined if len(joined) == 1 else joined[: len(distance)]) & is_near
 
 
 def _ratio(part: int, whole: int) -> float | None:

@@ -32,6 +32,7 @@ from physhandi.metrics.contact import (
     ContactLabels,
     ContactReference,
     contact_scores,
+    hand_distance,
     joined_nodes,
     predicted_contacts,
     proximity_labels,
@@ -367,7 +368,8 @@ def _predicted(
 ) -> dict[str, Bool[ndarray, "frame node"]]:
     if contact is None:
         return {}
-    return {name: predicted_contacts(contact, nodes, value) for name, value in THRESHOLDS.items()}
+    distance = hand_distance(nodes, contact.hand[: len(nodes)])
+    return {name: predicted_contacts(contact, distance, t) for name, t in THRESHOLDS.items()}
 
 
 def _judged(

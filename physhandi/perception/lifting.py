@@ -157,8 +157,10 @@ def fuse(parts: list[Float[ndarray, "_ 3"]]) -> Float[ndarray, "point 3"]:
     if len(joined) == 0:
         return joined.astype(np.float32)
     voxel = np.floor(joined / VOXEL).astype(np.int64)
-    _, owner, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
-    owner = owner.reshape(-1)
+    voxel -= voxel.min(axis=0)
+    # One number a voxel, because rows of three take six times as long to sort.
+    number = np.ravel_multi_index(tuple(voxel.T), tuple(voxel.max(axis=0) + 1))
+    _, owner, count = np.unique(number, return_inverse=True, return_counts=True)
     total = [np.bincount(owner, weights=joined[:, axis]) for axis in range(3)]
     mean = np.stack(total, axis=1) / count[:, None]
     tree = KDTree(mean)

@@ -55,8 +55,9 @@ def object_springs(
     is_kept &= (distance < connection_radius) & (distance > MINIMUM_LENGTH)
     first = np.broadcast_to(own, neighbor.shape)[is_kept]
     second = neighbor[is_kept]
-    pair = np.stack([np.minimum(first, second), np.maximum(first, second)], axis=1)
-    springs = np.unique(pair, axis=0).astype(np.int32)
+    # One number a pair, because rows of two take ten times as long to sort.
+    pair = np.unique(np.minimum(first, second) * node_count + np.maximum(first, second))
+    springs = np.stack(np.divmod(pair, node_count), axis=1).astype(np.int32)
     return springs, np.linalg.norm(node[springs[:, 1]] - node[springs[:, 0]], axis=1)
 
 

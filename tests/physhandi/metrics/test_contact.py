@@ -102,9 +102,10 @@ def test_springs_predict_in_frame_0_and_proximity_afterwards() -> None:
         kind="true",
         labels={},
     )
-    predicted = predicted_contacts(reference, np.stack([NODE] * 3), 0.005)
+    distance = hand_distance(np.stack([NODE] * 3), reference.hand)
+    predicted = predicted_contacts(reference, distance, 0.005)
     assert predicted.astype(int).tolist() == [[1, 1, 0, 0, 0], [1, 0, 0, 0, 0], [0, 1, 0, 0, 0]]
-    assert predicted_contacts(reference, np.stack([NODE] * 3), 0.021)[1].sum() == 2
+    assert predicted_contacts(reference, distance, 0.021)[1].sum() == 2
 
 
 def test_true_contact_goes_to_the_nearest_node() -> None:
