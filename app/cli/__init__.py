@@ -4,7 +4,7 @@ import logging
 import sys
 from typing import TYPE_CHECKING
 
-from physhandi.child import end_without_collecting
+from physhandi.child import end_without_collecting, loading_modules
 from physhandi.errors import PhysHandiError, UsageError, describe
 
 if TYPE_CHECKING:
@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 def build() -> "SubcommandApp":
     """Make the tree of commands; their docstrings and types are the help text."""
     # Here, because processes of suites start in this package and need none of the commands.
-    from tyro.extras import SubcommandApp
+    with loading_modules():
+        from tyro.extras import SubcommandApp
 
-    from app.cli import benchmark, data_folder, recordings, runs, serving
-    from app.cli.suite import evaluate_suite
+        from app.cli import benchmark, data_folder, recordings, runs, serving
+        from app.cli.suite import evaluate_suite
 
     imports = SubcommandApp()
     imports.command(name="capture")(recordings.import_capture)

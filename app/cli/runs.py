@@ -22,6 +22,7 @@ from app.jobs.order import default_name, fit_settings
 from app.jobs.processes import WORKER
 from app.settings import LOCAL
 from physhandi.api import prepare_run
+from physhandi.child import loading_modules
 from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE, SPLATS_FILE
 from physhandi.data.run import RunKind
 from physhandi.data.run_folder import new_run_id
@@ -356,7 +357,8 @@ def gallery(
 def _measured(
     run: str, data_dir: Path | None, *, draws: bool, device: str = "cpu"
 ) -> dict[str, Any]:
-    from physhandi import pipeline
+    with loading_modules():
+        from physhandi import pipeline
 
     finished = find_result(run, data_dir)
     sequences = open_catalog(data_dir).sequences_of(finished)
@@ -392,7 +394,8 @@ def _execute(
     run: Run, device: str, *more_devices: str, store: RunStore | None = None
 ) -> dict[str, Any]:
     """Fill a run; see `_result`."""
-    from physhandi import pipeline
+    with loading_modules():
+        from physhandi import pipeline
 
     with watched(True) as progress:
         pipeline.run_job(run, progress, device=device, more_devices=more_devices, store=store)

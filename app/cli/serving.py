@@ -7,6 +7,7 @@ from pathlib import Path
 
 from app.cli.lookup import open_catalog, read_settings
 from app.cli.output import DataDir, Store
+from physhandi.child import loading_modules
 from physhandi.devices import pick_device, pick_devices
 from physhandi.run_store import RunStore
 
@@ -48,8 +49,9 @@ def serve(
             everything and change nothing (PHYSHANDI_READ_ONLY_TOKEN_FILE).
         demo: Also queue a quick fit of the bundled sequence.
     """
-    from app.logs import write_logs
-    from app.server import serve as serve_application
+    with loading_modules():
+        from app.logs import write_logs
+        from app.server import serve as serve_application
 
     settings = read_settings(
         host=host,

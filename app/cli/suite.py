@@ -15,6 +15,7 @@ from app.cli.lookup import cluster_settings, find_sequence, read_settings
 from app.cli.output import AsJson, DataDir, Devices, Engine, show
 from app.jobs.engines.ray_engine import reached_cluster
 from app.settings import LOCAL
+from physhandi.child import loading_modules
 from physhandi.data.sequence import Sequence
 from physhandi.devices import ONLY_CARD, pick_devices
 from physhandi.errors import UsageError
@@ -81,19 +82,19 @@ def evaluate_suite(
     Raises:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
-    from app.cli.suite_jobs import WORKER, SuiteJobs
-    from app.cli.suite_processes import SuiteProcesses
-    from physhandi.synthetic.suite.evaluation import Order
-    from physhandi.synthetic.suite.evaluation import evaluate_suite as compare
-    from physhandi.synthetic.suite.folder import check_folder
-    from physhandi.synthetic.suite.methods import method_settings, parse_method, searched_from
-    from physhandi.synthetic.suite.suite import (
-        NAMED_SETTINGS,
-        check_seeds,
-        find_suite,
-        make_one_by_one,
-        make_recordings,
-    )
+    with loading_modules():
+        from app.cli.suite_jobs import WORKER, SuiteJobs
+        from app.cli.suite_processes import SuiteProcesses
+        from physhandi.synthetic.suite import evaluation
+        from physhandi.synthetic.suite.folder import check_folder
+        from physhandi.synthetic.suite.methods import method_settings, parse_method, searched_from
+        from physhandi.synthetic.suite.suite import (
+            NAMED_SETTINGS,
+            check_seeds,
+            find_suite,
+            make_one_by_one,
+            make_recordings,
+        )
 
     start = time.monotonic()
     given = {
@@ -131,7 +132,7 @@ def evaluate_suite(
         make = partial(make_one_by_one, progress=progress) if workers is None else workers.make
         environment = workers.environment() if isinstance(workers, SuiteJobs) else {}
         alone = ONLY_CARD if workers and devices[0] != "cpu" else devices[0]
-        order = Order(
+        order = evaluation.Order(
             title=title,
             recordings=tuple(named) or make_recordings(chosen, seeds, out / "sequences", make),
             methods=methods,
@@ -148,7 +149,7 @@ def evaluate_suite(
         for recording in order.recordings:
             recording.validate(reads_color=False)
         fill = None if workers is None else workers.fill(order, out)
-        result = compare(order, out, progress, fill=fill)
+        result = evaluation.evaluate_suite(order, out, progress, fill=fill)
     show(result | {"seconds": round(time.monotonic() - start, 1)}, as_json=as_json)
 
 

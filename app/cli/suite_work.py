@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from physhandi.child import loading_modules
 from physhandi.data.files import plain
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
@@ -106,13 +107,15 @@ class PieceWorker:
         """
         # What computes takes two seconds to import; not every process of a suite computes.
         if "make" in request:
-            from physhandi.synthetic.suite.suite import make_recording
+            with loading_modules():
+                from physhandi.synthetic.suite.suite import make_recording
 
             make_recording(request["make"], Path(request["target"]), self._progress)
             return
         asked = (request["order"], request["out"])
         if self._fill is None or self._order != asked:
-            from physhandi.synthetic.suite.evaluation import filler
+            with loading_modules():
+                from physhandi.synthetic.suite.evaluation import filler
 
             self._order = asked
             order = order_from_json(request["order"])

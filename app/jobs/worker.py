@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from app.jobs.processes import STORE
-from physhandi.child import Channel, run_child
+from physhandi.child import Channel, loading_modules, run_child
 from physhandi.errors import CancelledError
 from physhandi.progress import Progress
 from physhandi.run import Run
@@ -66,7 +66,8 @@ def fill_run(run_folder: Path, device: str, step: Callable[[], None]) -> None:
     """
     run = Run.open(run_folder)
     logger.info("run %s begins on %s", run.id, device)
-    from physhandi import pipeline
+    with loading_modules():
+        from physhandi import pipeline
 
     url = os.environ.get(STORE)
     store = RunStore(url) if url else None

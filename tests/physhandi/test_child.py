@@ -126,6 +126,29 @@ def test_a_child_ends_with_its_parent_unless_it_outlives_it() -> None:
     free.kill()
 
 
+def test_modules_are_loaded_without_searches_for_garbage_and_left_out_of_later_ones() -> None:
+    code = """
+import gc
+from physhandi.child import loading_modules
+searches = []
+gc.callbacks.append(lambda phase, _: searches.append(phase))
+with loading_modules():
+    import tomllib
+    kept = [[number] for number in range(10_000)]
+assert searches == []
+assert gc.isenabled() and gc.get_freeze_count() > len(kept)
+frozen = gc.get_freeze_count()
+gc.disable()
+with loading_modules():
+    import tomllib
+assert not gc.isenabled() and gc.get_freeze_count() == frozen
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=PACKAGE_ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_what_is_printed_goes_to_the_log_and_not_among_the_messages(tmp_path: Path) -> None:
     log = tmp_path / "log.txt"
     log.write_text("before\n")
