@@ -158,6 +158,8 @@ def fuse(parts: list[Float[ndarray, "_ 3"]]) -> Float[ndarray, "point 3"]:
         return joined.astype(np.float32)
     voxel = np.floor(joined / VOXEL).astype(np.int64)
     voxel -= voxel.min(axis=0)
+    if np.prod(voxel.max(axis=0) + 1.0) > 2.0**62:  # Depth in a wrong unit is kilometres away.
+        voxel = np.stack([np.unique(axis, return_inverse=True)[1] for axis in voxel.T], axis=1)
     # One number a voxel, because rows of three take six times as long to sort.
     number = np.ravel_multi_index(tuple(voxel.T), tuple(voxel.max(axis=0) + 1))
     _, owner, count = np.unique(number, return_inverse=True, return_counts=True)

@@ -97,6 +97,9 @@ def test_fuse_averages_a_voxel_and_drops_lonely_points():
     fused = fuse([above, below, np.array([[0.5, 0.5, 0.5]])])
     assert fused.shape == (100, 3)
     np.testing.assert_allclose(fused[:, 2], 0.0022, atol=1e-6)
+    # So many voxels lie between these that no number is large enough for all.
+    far = np.array([[9e6, -9e6, 9e6], [-9e6, 9e6, -9e6]])
+    np.testing.assert_array_equal(fuse([above, below, far]), fused)
     assert fuse([]).shape == (0, 3)
 
 
