@@ -6,6 +6,8 @@ from typing import Any
 from axe_playwright_python.base import AXE_SCRIPT
 from playwright.sync_api import Frame, Page
 
+COLOR_RULES = ("color-contrast", "link-in-text-block")
+"""What axe looks for in colors: all that another color scheme can violate."""
 _GRAVE = {"serious", "critical"}
 _RUN = "options => axe.run(options)"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from accessibility import violations
+from accessibility import COLOR_RULES, violations
 from clicked_disc import HEIGHT, TOP, WIDTH, cameras, center, write_disc
 from playwright.sync_api import Page, Route, expect
 from raw_capture import RawCapture
@@ -172,7 +172,7 @@ def test_no_page_keeps_anybody_out(home: Page, base: str) -> None:
         home.goto(f"{base}{path}")
         assert violations(home) == [], path
         home.emulate_media(color_scheme="dark")
-        assert violations(home, "color-contrast") == [], f"{path} in the dark"
+        assert violations(home, *COLOR_RULES) == [], f"{path} in the dark"
 
 
 def test_a_damaged_run_is_told_and_moved_aside(home: Page, base: str, served) -> None:
