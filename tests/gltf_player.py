@@ -1,5 +1,6 @@
 """Reads binary glTF files by pygltflib and plays them by the specification."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ class Player:
             np.testing.assert_allclose(bounds.max(0), accessor.max, atol=1e-6)
         return flat if width == 1 else flat.reshape(-1, width)
 
+    @cached_property
     def channels(self) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray]]:
         (animation,) = self.gltf.animations
         found = {}
@@ -50,7 +52,7 @@ class Player:
         return [node.name for node in self.gltf.nodes].index(name)
 
     def transform(self, node: int, frame: int) -> np.ndarray:
-        channels, fields = self.channels(), self.gltf.nodes[node]
+        channels, fields = self.channels, self.gltf.nodes[node]
         local = np.eye(4)
         for path in ("translation", "rotation"):
             value = getattr(fields, path)
@@ -90,5 +92,5 @@ class Player:
         """Vertices of a moving point cloud or surface at the key of a frame."""
         node = self.node(name)
         primitive = self.gltf.meshes[self.gltf.nodes[node].mesh].primitives[0]
-        time, weight = self.channels()[node, "weights"]
+        time, weight = self.channels[node, "weights"]
         return self.morphed(name, primitive, weight.reshape(len(time), -1)[frame])

@@ -75,7 +75,7 @@ def test_the_object_moves_as_in_the_run(tmp_path: Path) -> None:
     nodes, springs = player.gltf.meshes[player.gltf.nodes[node].mesh].primitives
     assert (nodes.mode, springs.mode) == (0, 1)
     np.testing.assert_array_equal(player.array(springs.indices).reshape(-1, 2), SPRINGS[:3])
-    time, weight = player.channels()[node, "weights"]
+    time, weight = player.channels[node, "weights"]
     np.testing.assert_allclose(time, np.arange(FRAMES) / RATE)
     weight = weight.reshape(FRAMES, FRAMES - 1)
     rollout = run.array("sequences/lift/rollout.npy")
@@ -94,7 +94,7 @@ def test_a_hand_without_a_skin_becomes_a_moving_surface(tmp_path: Path) -> None:
     assert "object" not in [node.name for node in player.gltf.nodes]
     node = player.node("left_hand")
     (primitive,) = player.gltf.meshes[player.gltf.nodes[node].mesh].primitives
-    weight = player.channels()[node, "weights"][1].reshape(FRAMES, FRAMES - 1)
+    weight = player.channels[node, "weights"][1].reshape(FRAMES, FRAMES - 1)
     expected = run.array("sequences/lift/hand_left_vertex.npy")
     for frame in range(FRAMES):
         found = player.morphed("left_hand", primitive, weight[frame])
