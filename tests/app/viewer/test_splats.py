@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from splat_world import splats_on, splats_seen
 from viewer_client import ViewerClient
@@ -114,12 +115,12 @@ def test_a_scene_opens_on_the_surface_and_moves_splats_that_a_link_asks_for(
             names = [name for name in client.nodes if name.startswith("/object/splats/")]
             if len(names) < MOST_GROUPS or not all(name in client.positions for name in names):
                 return False
-            return distances(splats_seen(client)[0], carried).min(axis=1).max() < 1e-4
+            return cdist(splats_seen(client)[0], carried).min(axis=1).max() < 1e-4
 
         client.until(is_there)
         middle, color = splats_seen(client)
         assert np.abs(position[17] - position[0]).max() > 0.05
-        which = distances(middle, carried).argmin(axis=1)
+        which = cdist(middle, carried).argmin(axis=1)
         assert sorted(which) == list(range(len(splats.center)))
         np.testing.assert_allclose(color, splats.color[which], atol=1 / 255)
 
@@ -128,11 +129,6 @@ def as_splats() -> SessionState:
     """What a link to splats asks for."""
     state = state_from_query({"show": "hands,splats,ground"})
     return replace(state, is_playing=True)
-
-
-def distances(point: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """How far every point is from every other one."""
-    return np.linalg.norm(point[:, None] - other[None], axis=-1)
 
 
 def test_a_key_goes_through_what_an_object_is_shown_as(sessions) -> None:
