@@ -14,6 +14,7 @@ import difflib
 import inspect
 import math
 import re
+import sys
 import threading
 import types
 import typing
@@ -169,7 +170,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 @cache
 def fields_of(kind: type[Settings]) -> tuple[Field, ...]:
     """List what a class of settings declares, field by field."""
-    meanings = _meanings(kind)
+    meanings = _meanings(kind.__module__)[kind.__name__]
     return tuple(_field(item, *meanings.get(item.name, ("", ""))) for item in _declared(kind))
 
 
@@ -351,14 +352,18 @@ _parsing = threading.Lock()
 _UNIT = re.compile(r"\s*\[((?:1/)?[A-Za-z][^\]\d]*)\]")
 
 
-def _meanings(kind: type) -> dict[str, tuple[str, str]]:
-    """Read meaning and unit of each field from the text below it."""
+@cache
+def _meanings(module: str) -> dict[str, dict[str, tuple[str, str]]]:
+    """Read meaning and unit of each field of a module's classes from the text below it."""
     # Python 3.11 counts the depth of a tree that it makes for all threads together, and fails.
     with _parsing:
-        (declared,) = ast.parse(inspect.getsource(kind)).body
+        declared = ast.parse(inspect.getsource(sys.modules[module])).body
+    return {item.name: _notes(item) for item in declared if isinstance(item, ast.ClassDef)}
+
+
+def _notes(declared: ast.ClassDef) -> dict[str, tuple[str, str]]:
     meanings: dict[str, tuple[str, str]] = {}
-    body = declared.body if isinstance(declared, ast.ClassDef) else []
-    for declaration, note in pairwise(body):
+    for declaration, note in pairwise(declared.body):
         if (
             isinstance(declaration, ast.AnnAssign)
             and isinstance(declaration.target, ast.Name)
