@@ -1,6 +1,7 @@
 """Arrays in files: NumPy's own ``.npy``, and safetensors."""
 
 import math
+import os
 import tokenize
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,6 +13,8 @@ from safetensors import numpy as safetensors_numpy
 from physhandi.data.files import write_atomically
 
 _MAGIC = b"\x93NUMPY"
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+"""Readers of headers by the version of the format."""
 _ODD = (tokenize.TokenError, SyntaxError, TypeError, KeyError, OverflowError, MemoryError)
 
 
@@ -46,31 +49,37 @@ def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
     """
     with path.open("rb") as stream:
         start = stream.read(len(_MAGIC))
-    if start != _MAGIC:
-        kinds = {b"": "the file is empty", b"PK": "it is an archive, not one array"}
-        raise ValueError(kinds.get(start[:2], "it does not begin as one"))
-    try:
-        _check_announced(path)
-        mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
-    except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
-        raise ValueError(f"its header is damaged ({error})") from error
+        if start != _MAGIC:
+            kinds = {b"": "the file is empty", b"PK": "it is an archive, not one array"}
+            raise ValueError(kinds.get(start[:2], "it does not begin as one"))
+        stream.seek(0)
+        try:
+            mapped = _mapped(path, stream)
+        except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
+            raise ValueError(f"its header is damaged ({error})") from error
     return mapped if mmap else np.array(mapped)
 
 
-def _check_announced(path: Path) -> None:
-    """Refuse an array whose header announces more than its file holds."""
-    with path.open("rb") as stream:
-        readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-        read = readers.get(npy.read_magic(stream))
-        if read is None:  # Names of fields that are not Latin, which NumPy judges itself.
-            return
-        shape, _, kind = read(stream)
-        announced, there = math.prod(shape) * kind.itemsize, path.stat().st_size - stream.tell()
-        if announced > there:
-            raise ValueError(
-                f"its header announces {shape} numbers of {kind}, {announced} bytes, but "
-                f"{there} follow"
-            )
+def _mapped(path: Path, stream: BinaryIO) -> np.ndarray:
+    """Map the array of an open file, as `numpy.load` does, which parses its header once more.
+
+    Raises:
+        ValueError: If its header announces more than the file holds, or Python objects.
+    """
+    read = _HEADERS.get(npy.read_magic(stream))
+    if read is None:  # Names of fields that are not Latin, which NumPy judges itself.
+        mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
+        return mapped
+    shape, is_fortran, kind = read(stream)
+    offset = stream.tell()
+    announced, there = math.prod(shape) * kind.itemsize, stream.seek(0, os.SEEK_END) - offset
+    if announced > there:
+        raise ValueError(
+            f"its header announces {shape} numbers of {kind}, {announced} bytes, but {there} follow"
+        )
+    if kind.hasobject:
+        raise ValueError("it holds Python objects")
+    return np.memmap(stream, kind, "r", offset, shape, "F" if is_fortran else "C")
 
 
 def read_tensors(path: Path) -> dict[str, np.ndarray]:
