@@ -45,6 +45,7 @@ def _look_for_no_garbage() -> Iterator[None]:
     """Trees stay: looking for garbage among them takes longer than parsing."""
     gc.disable()
     yield
+    tree.cache_clear()
     gc.enable()
 
 
