@@ -42,7 +42,7 @@ import torch
 
 def patches(image, place, reach):
     """Values (point, window) of a gray image around whole places (point, 2) as x, y."""
-    step = torch.arange(-reach, reach + 1)
+    step = torch.arange(-reach, reach + 1, device=image.device)
     row = (place[:, 1, None] + step).clamp(0, image.shape[0] - 1)
     column = (place[:, 0, None] + step).clamp(0, image.shape[1] - 1)
     return image[row[:, :, None], column[:, None, :]].flatten(1)
@@ -62,10 +62,10 @@ class Matcher(torch.nn.Module):
         self.template = patches(image, self.place, self.window)
 
     def step(self, image):
-        best, least = self.place, torch.full((len(self.place),), torch.inf)
+        best, least = self.place, image.new_full((len(self.place),), torch.inf)
         for down in range(-self.search, self.search + 1):
             for across in range(-self.search, self.search + 1):
-                there = self.place + torch.tensor([across, down])
+                there = self.place + self.place.new_tensor([across, down])
                 cost = ((patches(image, there, self.window) - self.template) ** 2).mean(1)
                 best = torch.where((cost < least)[:, None], there, best)
                 least = torch.minimum(least, cost)

@@ -119,7 +119,7 @@ DAMAGED: dict[str, tuple[str, Any, str, str]] = {
     "no stage": ("progress.json", {"time": 1.0}, "progress", "field 'stage' is missing"),
     "no number": ("progress.json", {"stage": "a", "attempt": "b"}, "progress", "'attempt' is wron"),
     "NaN": ("progress.json", b'{"stage": "a", "loss": NaN}', "progress", "as JSON"),
-    "deep": ("progress.json", b"[" * 3000, "progress", "nested too deeply"),
+    "deep": ("progress.json", b"[" * 100_000, "progress", "nested too deeply"),
     "huge": (
         "progress.json",
         b'{"stage": "a", "a": [1%s]}' % (b"0" * 400),
