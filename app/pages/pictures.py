@@ -1,9 +1,9 @@
 """The small pictures of runs and sequences, as files of addresses that change with them."""
 
+from contextlib import suppress
 from typing import Any
 
 from fastapi import APIRouter, Response
-from fastapi.responses import FileResponse
 
 from app.ids import ItemId
 from app.previews.store import PreviewKind, Previews
@@ -24,7 +24,8 @@ def add_pictures(router: APIRouter, previews: Previews) -> None:
         path = previews.file(kind, item_id, is_moving=is_moving)
         if path is not None:
             headers = _KEPT if version and f"-{version}." in path.name else _AGAIN
-            return FileResponse(path, media_type="image/webp", headers=headers)
+            with suppress(FileNotFoundError):  # It may be cleared away at this moment.
+                return Response(path.read_bytes(), media_type="image/webp", headers=headers)
         picture = previews.look(kind, item_id)
         # Nothing yet, or nothing ever: neither is an error of whoever looks at the page.
         return Response(status_code=202 if picture.state == "pending" else 204, headers=_AGAIN)

@@ -332,3 +332,14 @@ def test_a_run_without_results_shows_its_sequence(world: World) -> None:
     assert f'<img class="still" src="{told["still"]}"' in page.replace("&amp;", "&")
     for missing in ("/runs/nothing/still", "/sequences/nothing/preview"):
         assert client.get(missing).status_code == 404
+
+
+def test_a_picture_that_is_cleared_away_while_it_is_asked_for_is_pending(
+    world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(Previews, "file", lambda *_, **__: tmp_path / "cleared_away.still.webp")
+    assert world.browser().get("/sequences/sheet/still").status_code == 202
+    (tmp_path / "cleared_away.still.webp").write_bytes(b"a picture")
+    answer = world.browser().get("/sequences/sheet/still")
+    assert (answer.status_code, answer.content) == (200, b"a picture")
+    assert answer.headers["content-type"] == "image/webp"
