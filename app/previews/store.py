@@ -25,7 +25,8 @@ logger = logging.getLogger(__name__)
 PreviewKind = Literal["run", "sequence"]
 _VERSION = 2
 _BATCH = 8
-_ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
+_FAULTLESS = (0, -signal.SIGTERM, -signal.SIGINT)
+"""How a process ends that is not to blame for what is missing: as it should, or from outside."""
 _PATIENCE = 10.0
 """Time that a preview may take by the clock, in its processor time."""
 _MOST_WAITING = 400
@@ -112,7 +113,7 @@ class Previews:
             return PreviewPictures("none")
         address, version = f"{source.kind}s/{source.id}", source.key[-16:]
         still = f"{address}/still?v={version}" if self._path(source, STILL).is_file() else ""
-        if self._path(source, MOVING).is_file():
+        if still and self._path(source, MOVING).is_file():
             return PreviewPictures("ready", still, f"{address}/preview?v={version}")
         if self._path(source, NONE).is_file():
             return PreviewPictures("none")
@@ -202,7 +203,7 @@ class Previews:
                 logger.info("%s", error)
         self._child = None
         undone = [s for s in missing if not self._is_settled(s)]
-        if undone and code not in _ENDED_FROM_OUTSIDE and not self._is_closed:
+        if undone and code not in _FAULTLESS and not self._is_closed:
             # The first one ended the process or kept it too long; the others are tried again.
             guilty = next((s for s in undone if not self._path(s, STILL).is_file()), undone[0])
             logger.warning("the preview of %s %s could not be drawn", guilty.kind, guilty.id)
@@ -212,7 +213,9 @@ class Previews:
                 self._waiting.update(others)
 
     def _is_settled(self, source: _Source) -> bool:
-        return any(self._path(source, ending).is_file() for ending in (MOVING, NONE))
+        # One of the two pictures may have been cleared away.
+        is_drawn = all(self._path(source, ending).is_file() for ending in (STILL, MOVING))
+        return is_drawn or self._path(source, NONE).is_file()
 
     def _tidy(self, batch: list[_Source]) -> None:
         """Remove previews of what has changed since, and the oldest ones if there are too many."""

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,25 @@ def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -
         previews.shutdown()
 
 
+@pytest.mark.parametrize("is_moving", [False, True])
+def test_a_preview_of_which_one_picture_was_cleared_away_is_drawn_again(
+    world: World, is_moving: bool
+) -> None:
+    previews = Previews(world.settings, world.catalog)
+    previews.look("sequence", "sheet")
+    previews.start()
+    try:
+        until_ready(previews, "sequence", "sheet")
+        picture = previews.file("sequence", "sheet", is_moving=is_moving)
+        assert picture is not None
+        picture.unlink()
+        assert previews.look("sequence", "sheet").state == "pending"
+        until_ready(previews, "sequence", "sheet")
+        assert picture.is_file()
+    finally:
+        previews.shutdown()
+
+
 def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,8 +271,8 @@ def test_a_folder_that_is_deleted_while_pictures_are_drawn_ends_nothing(
             if self.code:
                 shutil.rmtree(world.settings.preview_dir)
                 raise ChildEndedError("worker", self.code, "")
-            for order in self.orders:
-                Path(f"{order['target']}{worker.MOVING}").write_bytes(b"RIFF")
+            for order, ending in product(self.orders, (worker.STILL, worker.MOVING)):
+                Path(f"{order['target']}{ending}").write_bytes(b"RIFF")
             yield from ()
 
         def kill(self) -> None:
