@@ -10,6 +10,7 @@ from physhandi.data.sequence import Sequence, View
 from physhandi.errors import MissingInputError
 from physhandi.perception.tracks import EDGE_STEP, lift_pixels, motion_validity
 from physhandi.progress import NullProgress, Progress
+from physhandi.unique_rows import unique_rows
 
 OBJECT_LABEL = 1
 """Mask value of the object."""
@@ -157,12 +158,7 @@ def fuse(parts: list[Float[ndarray, "_ 3"]]) -> Float[ndarray, "point 3"]:
     if len(joined) == 0:
         return joined.astype(np.float32)
     voxel = np.floor(joined / VOXEL).astype(np.int64)
-    voxel -= voxel.min(axis=0)
-    if np.prod(voxel.max(axis=0) + 1.0) > 2.0**62:  # Depth in a wrong unit is kilometres away.
-        voxel = np.stack([np.unique(axis, return_inverse=True)[1] for axis in voxel.T], axis=1)
-    # One number a voxel, because rows of three take six times as long to sort.
-    number = np.ravel_multi_index(tuple(voxel.T), tuple(voxel.max(axis=0) + 1))
-    _, owner, count = np.unique(number, return_inverse=True, return_counts=True)
+    _, _, owner, count = unique_rows(voxel)
     total = [np.bincount(owner, weights=joined[:, axis]) for axis in range(3)]
     mean = np.stack(total, axis=1) / count[:, None]
     tree = KDTree(mean)

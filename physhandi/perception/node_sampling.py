@@ -30,6 +30,7 @@ from physhandi.perception.shape_class import (
     rim_points,
 )
 from physhandi.triangles import SurfaceSamples
+from physhandi.unique_rows import unique_rows
 
 MAX_GAP = 0.04
 """Widest gap in a surface that is closed without knowing whether a hand hides it [m]."""
@@ -299,9 +300,9 @@ def solid_nodes(
         ground_height: Height below which there is nothing [m].
     """
     origin, key, surface = _surface_voxels(cloud, spacing, ground_height)
-    column, of_column = np.unique(key[:, :2], axis=0, return_inverse=True)
+    column, _, of_column, _ = unique_rows(key[:, :2])
     top = np.zeros(len(column), dtype=np.int64)
-    np.maximum.at(top, of_column.reshape(-1), key[:, 2])
+    np.maximum.at(top, of_column, key[:, 2])
     inside = np.concatenate(
         [
             np.column_stack([np.repeat(place[None], level, axis=0), np.arange(level)])
@@ -324,8 +325,7 @@ def _surface_voxels(
     floor = ground_height if stands and ground_height is not None else low[2]
     origin = np.array([low[0], low[1], floor])
     voxel = np.floor((cloud - origin) / spacing).astype(np.int64)
-    key, owner, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
-    owner = owner.reshape(-1)
+    key, _, owner, count = unique_rows(voxel)
     total = [np.bincount(owner, weights=cloud[:, axis]) for axis in range(3)]
     return origin, key, np.stack(total, axis=1) / count[:, None]
 

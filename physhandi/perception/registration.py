@@ -10,6 +10,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from physhandi.unique_rows import unique_rows
+
 NEIGHBORS = 8
 """Nodes beside each node that keep their distance from it while the object is bent."""
 STIFFNESSES = (10.0, 3.0, 1.0, 0.3)
@@ -110,7 +112,7 @@ class _Neighborhoods:
         distance, near = (np.asarray(columns) for columns in query)
         first = np.repeat(np.arange(len(node)), count - 1)
         one_way = np.stack([first, near[:, 1:].ravel()], axis=1)
-        pair = np.unique(np.concatenate([one_way, one_way[:, ::-1]]), axis=0)
+        pair = unique_rows(np.concatenate([one_way, one_way[:, ::-1]]))[0]
         row = np.tile(np.arange(len(pair)), 2)
         sign = np.repeat([-1.0, 1.0], len(pair))
         entries = coo_array((sign, (row, pair.T.ravel())), shape=(len(pair), len(node)))

@@ -27,6 +27,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 from physhandi.data.sequence_meta import ShapeClass
+from physhandi.unique_rows import unique_rows
 
 HiddenTest = Callable[[Float[ndarray, "point 3"]], Bool[ndarray, " point"]]
 """Whether the object may occupy world points at which no cloud point lies."""
@@ -331,8 +332,7 @@ def columns(
     """
     start = cloud[:, :2].min(axis=0) - 2 * cell
     index = np.floor((cloud[:, :2] - start) / cell).astype(np.int64)
-    place, owner = np.unique(index, axis=0, return_inverse=True)
-    owner = owner.reshape(-1)
+    place, _, owner, _ = unique_rows(index)
     top, low = np.full(len(place), -np.inf), np.full(len(place), np.inf)
     np.maximum.at(top, owner, cloud[:, 2] - ground_height)
     np.minimum.at(low, owner, cloud[:, 2] - ground_height)

@@ -22,6 +22,7 @@ from scipy.spatial.distance import pdist, squareform
 
 from physhandi.rotations import parallel_transport, smallest_rotations
 from physhandi.simulation.surface import is_line, triangulate_nodes, typical_distance
+from physhandi.unique_rows import unique_rows
 
 MOST_VERTICES = 4_500
 """A surface is subdivided while it has no more vertices than this: 54 kB of coordinates a frame."""
@@ -196,15 +197,11 @@ class _Edges:
     """
 
     def __init__(self, face: Int[ndarray, "face 3"]) -> None:
-        ends = np.concatenate([face[:, [1, 2]], face[:, [2, 0]], face[:, [0, 1]]]).astype(np.int64)
-        low, high = ends.min(axis=1), ends.max(axis=1)
-        size = int(high.max()) + 1
-        # One number for both ends: NumPy finds equal numbers ten times as fast as equal rows.
-        key, number, count = np.unique(low * size + high, return_inverse=True, return_counts=True)
-        self.pair = np.stack(np.divmod(key, size), axis=1)
+        ends = np.concatenate([face[:, [1, 2]], face[:, [2, 0]], face[:, [0, 1]]])
+        self.pair, _, number, count = unique_rows(np.sort(ends, axis=1))
         self._of_face = number.reshape(3, -1).T
         self._opposite = face.T.ravel()
-        self._number = number.ravel()
+        self._number = number
         self.is_border = count != 2
 
     def subdivision(self, count: int, is_corner: Bool[ndarray, " vertex"]) -> Any:

@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.spatial import Delaunay, KDTree, QhullError
 
+from physhandi.unique_rows import unique_rows
+
 _AROUND = 16
 """Neighbors that tell how an object lies around a node."""
 _REACH = 2.6
@@ -237,9 +239,7 @@ def _volume(point: Float[ndarray, "node 3"], largest: float) -> Int[ndarray, "fa
     tetrahedra = tetrahedra[_circumsphere(point[tetrahedra]) <= largest]
     opposite = np.concatenate([tetrahedra[:, i] for i in range(4)])
     faces = np.concatenate([np.delete(tetrahedra, i, axis=1) for i in range(4)])
-    _, first, count = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
+    _, first, _, count = unique_rows(np.sort(faces, axis=1))
     first = first[count == 1]
     faces, opposite = faces[first], opposite[first]
     a, b, c = (point[faces[:, i]] for i in range(3))

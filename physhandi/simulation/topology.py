@@ -11,6 +11,7 @@ from physhandi.simulation.contact_intervals import ContactIntervals, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.rod import Rod
+from physhandi.unique_rows import unique_rows
 
 MINIMUM_LENGTH = 1e-4
 """Object nodes that are no farther apart than this are not joined [m]."""
@@ -55,9 +56,8 @@ def object_springs(
     is_kept &= (distance < connection_radius) & (distance > MINIMUM_LENGTH)
     first = np.broadcast_to(own, neighbor.shape)[is_kept]
     second = neighbor[is_kept]
-    # One number a pair, because rows of two take ten times as long to sort.
-    pair = np.unique(np.minimum(first, second) * node_count + np.maximum(first, second))
-    springs = np.stack(np.divmod(pair, node_count), axis=1).astype(np.int32)
+    pair = np.stack([np.minimum(first, second), np.maximum(first, second)], axis=1)
+    springs = unique_rows(pair)[0].astype(np.int32)
     return springs, np.linalg.norm(node[springs[:, 1]] - node[springs[:, 0]], axis=1)
 
 

@@ -15,7 +15,7 @@ INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.
 PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
     *("rotations.py", "quaternions.py", "adam.py", "one_thread.py", "typed.py"),
-    *("data", "hand", "perception", "simulation", "fitting"),
+    *("unique_rows.py", "data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     "metrics/truth_metrics.py",
     *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),
@@ -25,7 +25,7 @@ PREDICTIONS = (
 LOOKS = (
     *("appearance", "rendering", "data", "metrics", "perception", "simulation"),
     *("settings.py", "srgb.py", "triangles.py", "rotations.py", "adam.py"),
-    *("one_thread.py", "typed.py", "fitting/appearance_fit.py"),
+    *("one_thread.py", "typed.py", "unique_rows.py", "fitting/appearance_fit.py"),
 )
 """Code that fits what an object looks like, and draws it."""
 SCORES = (
