@@ -92,8 +92,10 @@ def test_runs_are_filtered_sorted_chosen_and_compared(home: Page, base: str, pic
 
 
 def test_a_picture_appears_when_it_is_made_and_moves_while_it_is_pointed_at(
-    home: Page, base: str
+    home: Page, base: str, served
 ) -> None:
+    for picture in (served.data_dir / "cache" / "previews").glob("sequence-towel_fold-*"):
+        picture.unlink()
     home.emulate_media(reduced_motion="no-preference")
     home.goto(f"{base}/sequences")
     card = home.locator("article[data-sequence=towel_fold]")
