@@ -129,7 +129,9 @@ class ScenePage:
     def type(self, label: str, text: str) -> None:
         """Type over what is in the field beside a slider, key by key."""
         field = self.field(label)
-        field.press("Control+a")
+        # Entered by Control+a, a field may move its caret behind a sign after all was selected,
+        # which ends that; entered with all selected, it moves none.
+        field.select_text()
         field.press_sequentially(text)
         self._send()
 
