@@ -66,25 +66,26 @@ def oracle_loss(scene, weights, values, counts=None):
     }
     moved = replace(scene, rest_shape=rest_shape(scene), **changes)
     position, velocity = simulate(moved, counts)
-    return float((weights[0] * position).sum() + (weights[1] * velocity).sum())
+    return (weights[0] * position + weights[1] * velocity).sum((-3, -2, -1))
 
 
-def finite_difference(scene, weights, name, index, step=1e-6):
-    """Differentiate by one number."""
-    loss = []
-    for sign in (1.0, -1.0):
-        values = arguments(scene)
-        values[name][index] += sign * step
-        loss.append(oracle_loss(scene, weights, values))
+def finite_differences(scene, weights, places, step=1e-6):
+    """Differentiate by single numbers, told by argument and index; all are simulated at once."""
+    signs = np.array([1.0, -1.0])
+    values = {
+        name: np.broadcast_to(value, (2, len(places), *value.shape)).copy()
+        for name, value in arguments(scene).items()
+    }
+    for place, (name, index) in enumerate(places):
+        values[name][(slice(None), place, *index)] += signs * step
+    loss = oracle_loss(scene, weights, values)
     return (loss[0] - loss[1]) / (2.0 * step)
 
 
 def directional_difference(scene, weights, name, direction, step=1e-6):
     """Differentiate along a direction; refuse to step over a change of the colliding pairs."""
-    values, loss, counts = arguments(scene), [], []
-    for sign in (1.0, -1.0):
-        counts.append([])
-        moved = {**values, name: values[name] + sign * step * direction}
-        loss.append(oracle_loss(scene, weights, moved, counts[-1]))
-    assert counts[0] == counts[1], "the step changes which nodes collide"
+    values, counts = arguments(scene), []
+    values[name] = np.stack([values[name] + sign * step * direction for sign in (1.0, -1.0)])
+    loss = oracle_loss(scene, weights, values, counts)
+    assert all(above == below for above, below in counts), "the step changes which nodes collide"
     return (loss[0] - loss[1]) / (2.0 * step)

@@ -1,5 +1,9 @@
-"""Float64 NumPy oracle of the spring-mass simulator, written from the equations alone."""
+"""Float64 NumPy oracle of the spring-mass simulator, written from the equations alone.
 
+Cases of one scene are simulated at once if fields have an axis of cases before their own axes.
+"""
+
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,25 +47,26 @@ def incidence(scene, count):
 def spring_force(scene, joins, x, v):
     """Force on every node; `joins` is the incidence of all springs."""
     gap, rate = joins @ x, joins @ v
-    length = np.sqrt((gap**2).sum(1))
-    unit = gap / np.maximum(length, 1e-6)[:, None]
+    length = np.sqrt((gap**2).sum(-1))
+    unit = gap / np.maximum(length, 1e-6)[..., None]
     tension = scene.stiffness * (length / scene.rest - 1.0)
-    tension = tension + scene.damping * (unit * rate).sum(1)
-    return -joins.T @ (tension[:, None] * unit)
+    tension = tension + scene.damping * (unit * rate).sum(-1)
+    return -joins.T @ (tension[..., None] * unit)
 
 
 def move_on_ground(scene, x, v, dt, plane):
     """Move nodes that may hit their planes: fly to the impact, bounce, fly on."""
-    gap = x[:, 2] - plane
-    hits = (gap + v[:, 2] * dt < 0.0) & (v[:, 2] < -1e-4)
+    gap = x[..., 2] - plane
+    hits = (gap + v[..., 2] * dt < 0.0) & (v[..., 2] < -1e-4)
     moved, velocity = x + dt * v, v.copy()
     if hits.any():
         e, mu = np.clip(scene.restitution, 0, 1), np.clip(scene.friction, 0, 2)
+        e, mu = (np.broadcast_to(each[..., None], hits.shape)[hits] for each in (e, mu))
         v_normal, v_tangent = v[hits] * [0.0, 0.0, 1.0], v[hits] * [1.0, 1.0, 0.0]
         slide = np.sqrt((v_tangent**2).sum(1))
         loss = mu * (1 + e) * np.sqrt((v_normal**2).sum(1)) / np.maximum(slide, 1e-6)
-        bounced = np.maximum(0.0, 1.0 - loss)[:, None] * v_tangent - e * v_normal
-        impact = (gap[hits] / -v[hits, 2])[:, None]
+        bounced = np.maximum(0.0, 1.0 - loss)[:, None] * v_tangent - e[:, None] * v_normal
+        impact = (gap[hits] / -v[hits][:, 2])[:, None]
         moved[hits] = x[hits] + impact * v[hits] + (dt - impact) * bounced
         velocity[hits] = bounced
     return moved, velocity
@@ -69,12 +74,12 @@ def move_on_ground(scene, x, v, dt, plane):
 
 def candidate_table(scene, x):
     """Which pairs may collide in the frame that starts at x, as a symmetric table."""
-    gaps = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in (x, rest_shape(scene))]
-    may = gaps[0] < scene.distance
-    if not scene.blocks_rest:
-        may &= gaps[1] >= scene.distance
-    np.fill_diagonal(may, False)
-    return may
+    gaps = [
+        np.linalg.norm(p[..., :, None, :] - p[..., None, :, :], axis=-1)
+        for p in (x, rest_shape(scene))
+    ]
+    may = (gaps[0] < scene.distance) & ~np.eye(x.shape[-2], dtype=bool)
+    return may if scene.blocks_rest else may & (gaps[1] >= scene.distance)
 
 
 def rest_shape(scene):
@@ -83,36 +88,46 @@ def rest_shape(scene):
 
 def collisions(scene, may, x, v):
     """Collide all pairs of the table at once: new velocities, and how many pairs collided."""
-    gap, rate = x[None] - x[:, None], v[None] - v[:, None]  # of j seen from i
-    length = np.sqrt((gap**2).sum(2))
-    hits = may & (length < scene.distance) & ((gap * rate).sum(2) < -1e-4)
-    normal = gap / np.where(hits, length, 1.0)[..., None]
+    *case, i, j = pairs = np.nonzero(may)
+    gap, rate = (value[(*case, j)] - value[(*case, i)] for value in (x, v))  # of j seen from i
+    length = np.sqrt((gap**2).sum(-1))
+    hits = (length < scene.distance) & ((gap * rate).sum(-1) < -1e-4)
+    *case, i, _ = (place[hits] for place in pairs)
+    rate, normal = rate[hits], gap[hits] / length[hits][:, None]
     e, mu = np.clip(scene.self_restitution, 0, 1), np.clip(scene.self_friction, 0, 2)
-    v_normal = (rate * normal).sum(2, keepdims=True) * normal
+    e, mu = (np.broadcast_to(each, may.shape[:-2])[tuple(case)][..., None] for each in (e, mu))
+    v_normal = (rate * normal).sum(-1, keepdims=True) * normal
     v_tangent = rate - v_normal
-    slide = np.maximum(np.sqrt((v_tangent**2).sum(2, keepdims=True)), 1e-6)
-    speed = np.sqrt((v_normal**2).sum(2, keepdims=True))
+    slide = np.maximum(np.sqrt((v_tangent**2).sum(-1, keepdims=True)), 1e-6)
+    speed = np.sqrt((v_normal**2).sum(-1, keepdims=True))
     kept = np.maximum(0.0, 1.0 - mu * (1 + e) * speed / slide)
     # Both weigh 1 kg, so that 1 / (1/m + 1/m) = 1/2.
     impulse = -(1 + e) * v_normal / 2 + (kept - 1) * v_tangent / 2
-    total = np.where(hits[..., None], impulse, 0.0).sum(1)
-    return v - total / np.maximum(hits.sum(1), 1)[:, None], int(hits.sum()) // 2
+    total, count = np.zeros(v.shape), np.zeros(v.shape[:-1], dtype=int)
+    np.add.at(total, (*case, i), impulse)
+    np.add.at(count, (*case, i), 1)
+    return v - total / np.maximum(count, 1)[..., None], count.sum(-1) // 2
 
 
 def simulate(scene, counts=None):
     """Positions and velocities of the object nodes at every frame.
 
-    A list given as `counts` gets the number of colliding pairs of every substep.
+    A list given as `counts` gets the number of colliding pairs of every substep. Cases come first.
     """
     dt = 1.0 / (scene.frame_rate * scene.substeps)
-    x, v = scene.node.astype(float), scene.velocity.astype(float)
+    shape = (*cases(scene), *scene.node.shape[-2:])
+    x, v = (np.broadcast_to(s, shape).astype(float) for s in (scene.node, scene.velocity))
     weight = np.array([0.0, 0.0, -scene.gravity])
-    plane = np.full(len(x), -np.inf if scene.ground is None else scene.ground)
+    count = shape[-2]
+    plane = np.full(count, -np.inf if scene.ground is None else scene.ground)
     if scene.clearance is not None:
         plane += scene.clearance
-    states, joins = [(x, v)], incidence(scene, len(x) + scene.control.shape[1])
+    drag = np.exp(-dt * np.asarray(scene.drag))[..., None, None]
+    controls = scene.control.shape[-2]
+    states, joins = [(x, v)], incidence(scene, count + controls)
+    held_at = np.moveaxis(scene.control, -3, 0)
     everything = scene
-    for frame, (start, end) in enumerate(zip(scene.control[:-1], scene.control[1:], strict=True)):
+    for frame, (start, end) in enumerate(itertools.pairwise(held_at)):
         if everything.attached is not None:
             begin, leave = everything.attached.T
             on = np.where((begin <= frame) & (frame + 1 <= leave), 1.0, 0.0)
@@ -123,12 +138,27 @@ def simulate(scene, counts=None):
         may = None if scene.distance is None else candidate_table(scene, x)
         for substep in range(scene.substeps):
             held = start + (end - start) * (substep + 1) / scene.substeps
-            force = spring_force(scene, joins, np.vstack([x, held]), np.vstack([v, rate]))[: len(x)]
-            free = (v + dt * (force + weight)) * np.exp(-dt * scene.drag)
+            force = spring_force(scene, joins, joined(x, held), joined(v, rate))[..., :count, :]
+            free = (v + dt * (force + weight)) * drag
             if may is not None:
-                free, count = collisions(scene, may, x, free)
+                free, collided = collisions(scene, may, x, free)
                 if counts is not None:
-                    counts.append(count)
+                    counts.append(collided)
             x, v = move_on_ground(scene, x, free, dt, plane)
         states.append((x, v))
-    return np.array([s[0] for s in states]), np.array([s[1] for s in states])
+    return np.stack([s[0] for s in states], -3), np.stack([s[1] for s in states], -3)
+
+
+def cases(scene):
+    """Give the shape of the axes of cases: of one scene alone, none."""
+    own_axes = {"node": 2, "velocity": 2, "control": 3, "stiffness": 1, "damping": 1}
+    own_axes |= dict.fromkeys(("drag", "restitution", "friction"), 0)
+    own_axes |= dict.fromkeys(("self_restitution", "self_friction"), 0)
+    shapes = ((np.shape(getattr(scene, name)), axes) for name, axes in own_axes.items())
+    return np.broadcast_shapes(*(shape[: len(shape) - axes] for shape, axes in shapes))
+
+
+def joined(nodes, controls):
+    """Put object nodes and control nodes into one array."""
+    controls = np.broadcast_to(controls, (*nodes.shape[:-2], *controls.shape[-2:]))
+    return np.concatenate([nodes, controls], axis=-2)
