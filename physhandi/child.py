@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, NoReturn, cast
@@ -248,6 +249,21 @@ class Child:
         self.end_requests()
         self._messages.close()
 
+    @contextmanager
+    def limited(self, time_limit_s: float) -> Generator[None]:
+        """Kill the process unless what is done meanwhile ends in time.
+
+        Args:
+            time_limit_s: That time [s].
+        """
+        timer = threading.Timer(time_limit_s, self._end_late)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+
     def _end_late(self) -> None:
         self._is_late = True
         self.kill()
@@ -259,6 +275,73 @@ class Child:
                 return
             while chunk := os.read(source.fileno(), 65536):
                 self._last_words = (self._last_words + chunk)[-_LAST_WORDS:]
+
+
+class AnsweringChild:
+    """A child that answers one request after another; when it has ended a new one is started.
+
+    One thread at a time may use it.
+    """
+
+    def __init__(self, module: str, *arguments: str, **options: Any) -> None:
+        """Prepare; the process starts with the first request.
+
+        Args:
+            module: See `Child`.
+            arguments: See `Child`.
+            options: See `Child`.
+        """
+        self._module = module
+        self._start = partial(Child, module, *arguments, **options)
+        self._child: Child | None = None
+        self._messages: Iterator[dict[str, Any]] = iter(())
+
+    def ask(self, request: object, time_limit_s: float) -> dict[str, Any]:
+        """Send a request and give the answer, its next message.
+
+        If the process ends, which may be another's doing, a new one is asked once more.
+
+        Args:
+            request: See `Child.send`.
+            time_limit_s: Time for the answer, after which the process is killed [s].
+
+        Raises:
+            ChildEndedError: If the second process ended, too, or the time was over.
+            PhysHandiError: What the process said before it ended.
+        """
+        try:
+            return self._ask(request, time_limit_s)
+        except ChildEndedError as end:
+            if end.is_late:
+                raise
+        return self._ask(request, time_limit_s)
+
+    def tell(self, request: object) -> None:
+        """Send a request that has no answer; a process that has not started need not know."""
+        if self._child is not None:
+            self._child.send(request)
+
+    def close(self) -> None:
+        """End the process."""
+        if self._child is not None:
+            self._child.close()
+        self._child = None
+
+    def _ask(self, request: object, time_limit_s: float) -> dict[str, Any]:
+        if self._child is None:
+            self._child = self._start()
+            self._messages = self._child.messages()
+        try:
+            with self._child.limited(time_limit_s):
+                self._child.send(request)
+                answer = next(self._messages, None)
+        except BaseException:  # An answer that nobody waits for is not that to the next request.
+            self.close()
+            raise
+        if answer is None:
+            self.close()
+            raise ChildEndedError(self._module, 0, "")
+        return answer
 
 
 def copy_log(source: IO[Any], path: Path) -> None:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy import ndarray
 
-from physhandi.child import Channel, Child, ChildEndedError, run_child
+from physhandi.child import AnsweringChild, Channel, ChildEndedError, run_child
 from physhandi.data.untrusted.image_header import MOST_PIXELS
 from physhandi.data.untrusted.pickles import limit
 from physhandi.errors import ImportFailedError
@@ -52,8 +52,7 @@ class MediaDecoder:
         """
         self._worker, self._memory, self._longest_s = worker, memory, longest_s
         self._lock = threading.Lock()
-        self._child: Child | None = None
-        self._messages: Any = None
+        self._child: AnsweringChild | None = None
         self._shared: Any = None
         self._area: mmap.mmap | None = None
 
@@ -92,78 +91,47 @@ class MediaDecoder:
         """Close a video."""
         with self._lock:
             if self._child is not None:
-                self._child.send({"do": "release", "path": str(path.absolute())})
+                self._child.tell({"do": "release", "path": str(path.absolute())})
 
     def close(self) -> None:
         """End the process, and give back what it shared."""
         with self._lock:
-            self._end()
+            if self._child is not None:
+                self._child.close()
             if self._area is not None:
                 self._area.close()
                 self._shared.close()
-            self._area = self._shared = None
+            self._child = self._area = self._shared = None
 
-    def _end(self) -> None:
-        if self._child is not None:
-            self._child.close()
-        self._child = None
-
-    def _start(self) -> None:
-        if self._shared is None:
-            self._shared = _memory()
-            self._area = mmap.mmap(self._shared.fileno(), _ROOM)
+    def _start(self) -> AnsweringChild:
+        self._shared = _memory()
+        self._area = mmap.mmap(self._shared.fileno(), _ROOM)
         descriptor = self._shared.fileno()
-        self._child = Child(
+        return AnsweringChild(
             self._worker, str(descriptor), str(self._memory), threads=1, pass_fds=[descriptor]
         )
-        self._messages = self._child.messages()
 
     def _ask(self, place: str, **request: object) -> tuple[dict[str, Any], ndarray | None]:
         with self._lock:
-            for is_last in (False, True):
-                if self._child is None:
-                    self._start()
-                answer = self._answer(place, request)
-                if answer is not None:
-                    return answer, self._received(answer)
-                self._end()
-                if is_last:
-                    break
-            raise ImportFailedError(
-                f"{place}: crashed what decodes it. It is damaged or made to do harm; record or "
-                "export it again."
-            )
-
-    def _answer(self, place: str, request: dict[str, object]) -> dict[str, Any] | None:
-        """Ask once; None if the process ended, which may also be another's doing."""
-        child, is_late = cast("Child", self._child), threading.Event()
-
-        def stop() -> None:
-            is_late.set()
-            child.kill()
-
-        timer = threading.Timer(self._longest_s, stop)
-        timer.daemon = True
-        timer.start()
-        try:
-            child.send(request)
-            answer = next(self._messages)
-        except (ChildEndedError, StopIteration):
-            if is_late.is_set():
-                self._end()
+            if self._child is None:
+                self._child = self._start()
+            try:
+                answer = self._child.ask(request, self._longest_s)
+            except ChildEndedError as end:
+                deed = (
+                    f"decoding it took more than {self._longest_s:g} s"
+                    if end.is_late
+                    else "crashed what decodes it"
+                )
                 raise ImportFailedError(
-                    f"{place}: decoding it took more than {self._longest_s:g} s. It is damaged or "
-                    "made to do harm; record or export it again."
+                    f"{place}: {deed}. It is damaged or made to do harm; record or export it again."
                 ) from None
-            return None
-        finally:
-            timer.cancel()
-        if answer.get("is_too_large"):
-            raise ImportFailedError(
-                f"{place}: decoding it needs more memory than is allowed "
-                f"({self._memory >> 20} MiB). It is damaged or made to do harm."
-            )
-        return answer
+            if answer.get("is_too_large"):
+                raise ImportFailedError(
+                    f"{place}: decoding it needs more memory than is allowed "
+                    f"({self._memory >> 20} MiB). It is damaged or made to do harm."
+                )
+            return answer, self._received(answer)
 
     def _received(self, answer: dict[str, Any]) -> ndarray | None:
         if "shape" not in answer:

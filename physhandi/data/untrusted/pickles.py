@@ -1,23 +1,28 @@
 """Foreign pickles, read in a child process that cannot execute what they ask for.
 
 A pickle is a program. Nothing in it is trusted: the child knows only stand-ins for containers and
-arrays, has limits of memory and time, and hands back arrays (.npz) and a tree (JSON).
+arrays, has limits of memory and time, and hands back arrays (.npz) and a tree (JSON). NumPy is
+loaded once, by a process that reads each file in a copy of itself, which ends with the file.
 """
 
+import atexit
 import encodings.cp437 as zip_text
 import gc
 import io
 import json
 import logging
 import math
+import os
 import pickle
 import resource
 import signal
 import sys
 import tempfile
+import threading
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,8 +30,8 @@ import numpy as np
 from numpy import ndarray
 from numpy.lib.stride_tricks import as_strided
 
-from physhandi.child import Channel, Child, ChildEndedError, run_child
-from physhandi.errors import ImportFailedError, PhysHandiError
+from physhandi.child import AnsweringChild, Channel, ChildEndedError, die_with_parent, run_child
+from physhandi.errors import ImportFailedError, PhysHandiError, describe
 
 _PLAIN_KINDS = "biufcSU"
 _BYTE_ORDERS = {"<", ">", "|", "="}
@@ -628,17 +633,41 @@ def limit_data(most_bytes: int) -> None:
 
 
 def _work(channel: Channel) -> None:
-    """Read the file that the arguments name."""
-    source, out, seconds, most_bytes = channel.arguments
+    """Read the files that requests name, each in a copy of this process."""
+    this = os.getpid()
+    for request in channel.requests():
+        copy = os.fork()
+        if copy == 0:
+            os._exit(_read_alone(channel, this, **request))
+        code = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])
+        if code != _REFUSED:
+            channel.tell(code=code)
+
+
+def _read_alone(
+    channel: Channel, parent: int, *, path: str, out: str, seconds: int, most_bytes: int
+) -> int:
+    """Read a file within limits; tells why it is refused, and gives the code to exit with."""
     # Nothing is thrown away here; the collector would search a growing tree again and again.
     gc.disable()
-    limit(int(seconds), int(most_bytes))
-    read(Path(source), Path(out), int(most_bytes))
+    try:
+        die_with_parent(parent)
+        limit(seconds, most_bytes)
+        read(Path(path), Path(out), most_bytes)
+    except (ImportFailedError, OSError, MemoryError) as error:
+        channel.tell(refused=describe(error))
+        return _REFUSED
+    except Exception:
+        logger.exception("stopped by a defect of the program")
+        return 1
+    return 0
 
 
 logger = logging.getLogger(__name__)
 
 _WORKER = "physhandi.data.untrusted.pickles"
+_REFUSED = 3
+"""Exit code of a copy that has told why it refuses its file."""
 _ADVICE = (
     "Only numbers, text, containers, NumPy arrays, sparse matrices, chumpy arrays and tensors of "
     "a torch checkpoint are read. Nothing of the file was executed; use the file as its publisher "
@@ -670,26 +699,48 @@ def read_untrusted(path: Path, *, time_limit_s: float = 120.0, memory_limit: int
     if not path.is_file():
         raise ImportFailedError(f"{path} is not a file.")
     with tempfile.TemporaryDirectory(prefix="physhandi-import-") as folder:
-        _read_in_child(path.absolute(), Path(folder), time_limit_s, memory_limit)
+        refusal = _reader().read(path.absolute(), Path(folder), time_limit_s, memory_limit)
+        if refusal:
+            raise ImportFailedError(f"{path}: refused, because {refusal}. {_ADVICE}")
         return _collect(Path(folder))
 
 
-def _read_in_child(path: Path, out: Path, time_limit_s: float, memory_limit: int) -> None:
-    limits = [str(max(1, round(time_limit_s))), str(memory_limit)]
-    reader = Child(_WORKER, str(path), str(out), *limits, threads=1, time_limit_s=time_limit_s)
-    try:
-        with reader:
-            for _ in reader.messages():
-                pass
-    except ChildEndedError as error:
-        logger.debug("the reader of %s said: %s", path, error.last_words)
-        if error.is_late:
-            reason = f"reading it took more than {time_limit_s:g} s"
-        else:
-            reason = f"its reader ended {_ending(error.code)}"
-        raise ImportFailedError(f"{path}: refused, because {reason}. {_ADVICE}") from None
-    except PhysHandiError as error:
-        raise ImportFailedError(f"{path}: refused, because {error}. {_ADVICE}") from None
+class _Reader:
+    """A process that reads one file after another; it is started by the first one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._child = AnsweringChild(_WORKER, threads=1)
+        atexit.register(self._child.close)
+
+    def read(self, path: Path, out: Path, time_limit_s: float, memory_limit: int) -> str:
+        """Have a file read; returns why it is refused, nothing if it is not."""
+        request = {
+            "path": str(path),
+            "out": str(out),
+            "seconds": max(1, round(time_limit_s)),
+            "most_bytes": memory_limit,
+        }
+        try:
+            with self._lock:
+                answer = self._child.ask(request, time_limit_s)
+        except ChildEndedError as end:
+            logger.debug("the reader of %s said: %s", path, end.last_words)
+            if end.is_late:
+                return f"reading it took more than {time_limit_s:g} s"
+            answer = {"code": end.code}
+        except PhysHandiError as error:
+            return str(error)
+        if "refused" in answer:
+            return str(answer["refused"])
+        code = int(answer["code"])
+        return f"its reader ended {_ending(code)}" if code else ""
+
+
+@cache
+def _reader() -> _Reader:
+    """Give the reader that all of this process share, so that NumPy is loaded once."""
+    return _Reader()
 
 
 def _ending(code: int) -> str:

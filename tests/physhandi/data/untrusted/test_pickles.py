@@ -7,6 +7,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import scipy.sparse
 import torch
@@ -172,6 +173,36 @@ def test_memory_and_time_are_limited(tmp_path: Path) -> None:
     assert read_untrusted(path).shape == (17_000_000,)
     with pytest.raises(ImportFailedError, match=r"took more than 0\.01 s"):
         read_untrusted(path, time_limit_s=0.01)
+
+
+def test_one_process_reads_all_files_each_in_a_copy_that_ends_with_it(tmp_path: Path) -> None:
+    good = _store(tmp_path, pickle.dumps([1, 2]), "good.pkl")
+    assert read_untrusted(good) == [1, 2]
+    (reader,) = readers()
+    for case in sorted(EXPLODING):  # Some end the copy without a word.
+        with pytest.raises(ImportFailedError):
+            read_untrusted(_store(tmp_path, BROKEN[case]()), memory_limit=1 << 29)
+    assert read_untrusted(good) == [1, 2]
+    assert readers() == [reader]
+    assert reader.children() == []
+
+
+def test_a_reader_that_was_killed_is_replaced(
+    tmp_path: Path,
+) -> None:
+    path = _store(tmp_path, pickle.dumps(np.arange(3)))
+    assert list(read_untrusted(path)) == [0, 1, 2]
+    (reader,) = readers()
+    reader.kill()
+    assert list(read_untrusted(path)) == [0, 1, 2]
+    assert readers() != [reader]
+
+
+def readers() -> list[psutil.Process]:
+    """The processes of this one that read pickles."""
+    module = "physhandi.data.untrusted.pickles"
+    children = psutil.Process().children()
+    return [process for process in children if module in process.cmdline()]
 
 
 def test_missing_files_are_named(tmp_path: Path) -> None:
