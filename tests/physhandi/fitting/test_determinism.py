@@ -77,11 +77,12 @@ def held(run: Run, problem: ObjectProblem) -> RefinementProblem:
 
 def in_order(gradients: Callable[[], list[torch.Tensor]]) -> list[torch.Tensor]:
     """Compute gradients while torch refuses whatever it cannot add in a fixed order."""
-    torch.use_deterministic_algorithms(True)
+    # As `use_deterministic_algorithms`, which imports PyTorch's compiler for seconds.
+    torch.set_deterministic_debug_mode("error")
     try:
         return gradients()
     finally:
-        torch.use_deterministic_algorithms(False)
+        torch.set_deterministic_debug_mode("default")
 
 
 def assert_fixed(gradients: Callable[[], list[torch.Tensor]], repeats: int = 3) -> None:

@@ -8,6 +8,7 @@ import torch
 from hand_scene import grasping
 from scipy.spatial.transform import Rotation
 
+from physhandi.adam import Adam
 from physhandi.fitting.hand_refinement import HandOffsets, OffsetDescent, control_nodes
 from physhandi.hand.loading import load_hand_model
 
@@ -98,8 +99,8 @@ def test_by_parameter_it_is_adam() -> None:
     hand = offsets()
     names = list(hand.value)
     twins = {name: torch.zeros_like(hand.value[name], requires_grad=True) for name in names}
-    groups = [{"params": [twins[name]], "lr": RATES[name]} for name in names]
-    adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+    rates = [(twins[name], RATES[name]) for name in names]
+    adam = Adam(rates, betas=(0.9, 0.99), epsilon=1e-12)
     descent = OffsetDescent(hand, RATES, 0.99, by_parameter=True)
     for seed in range(4):
         gradients(hand, seed)
