@@ -357,11 +357,12 @@ def gallery(
 def _measured(
     run: str, data_dir: Path | None, *, draws: bool, device: str = "cpu"
 ) -> dict[str, Any]:
+    finished = find_result(run, data_dir)
+    sequences = open_catalog(data_dir).sequences_of(finished)
+    # What measures takes seconds to load, for which a wrong name need not wait.
     with loading_modules():
         from physhandi import pipeline
 
-    finished = find_result(run, data_dir)
-    sequences = open_catalog(data_dir).sequences_of(finished)
     with watched(True) as progress:
         return pipeline.evaluate(
             finished,

@@ -179,23 +179,29 @@ def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -
         previews.shutdown()
 
 
-@pytest.mark.parametrize("is_moving", [False, True])
-def test_a_preview_of_which_one_picture_was_cleared_away_is_drawn_again(
-    world: World, is_moving: bool
-) -> None:
-    previews = Previews(world.settings, world.catalog)
-    previews.look("sequence", "sheet")
-    previews.start()
-    try:
-        until_ready(previews, "sequence", "sheet")
-        picture = previews.file("sequence", "sheet", is_moving=is_moving)
+def test_a_preview_of_which_one_picture_was_cleared_away_is_drawn_again(world: World) -> None:
+    shown = (("sequence", "sheet", False), ("run", "fitted", True))
+
+    def draw() -> None:
+        """Have the pictures of both drawn, by one process."""
+        previews = Previews(world.settings, world.catalog)
+        for kind, name, _ in shown:
+            assert previews.look(kind, name).state == "pending"
+        previews.start()
+        try:
+            for kind, name, _ in shown:
+                until_ready(previews, kind, name)
+        finally:
+            previews.shutdown()
+
+    draw()
+    kept = Previews(world.settings, world.catalog)
+    cleared = [kept.file(kind, name, is_moving=is_moving) for kind, name, is_moving in shown]
+    for picture in cleared:
         assert picture is not None
         picture.unlink()
-        assert previews.look("sequence", "sheet").state == "pending"
-        until_ready(previews, "sequence", "sheet")
-        assert picture.is_file()
-    finally:
-        previews.shutdown()
+    draw()
+    assert all(picture is not None and picture.is_file() for picture in cleared)
 
 
 def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
