@@ -132,7 +132,8 @@ class PhysTwinLike:
         return launch
 
     def _capture(self, launch: Any) -> wp.Graph:
-        with wp.ScopedCapture(device=self.device, force_module_load=True) as capture:
+        is_cuda = wp.get_device(self.device).is_cuda
+        with wp.ScopedCapture(device=self.device, force_module_load=is_cuda) as capture:
             launch()
         if capture.graph is None:
             raise RuntimeError(f"Warp captured no graph on {self.device}.")

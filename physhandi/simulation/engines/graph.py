@@ -34,7 +34,10 @@ class LaunchGraph:
                 captured again.
         """
         if self.graph is None or version != self._version:
-            with wp.ScopedCapture(device=self._device, force_module_load=True) as capture:
+            # While a GPU captures, older drivers load no module. On a CPU all modules of this
+            # process, once compiled, would cost far more than the few that are launched.
+            is_ahead = self._device.is_cuda
+            with wp.ScopedCapture(device=self._device, force_module_load=is_ahead) as capture:
                 self._launches()
             if capture.graph is None:
                 raise RuntimeError(f"Warp captured no graph on {self._device}.")
