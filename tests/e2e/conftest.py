@@ -75,6 +75,7 @@ class Served:
     """The one for people who may only look."""
     data_dir: Path
     """Where it keeps runs."""
+    process_id: int
 
     @property
     def base(self) -> str:
@@ -90,6 +91,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.no_cover)
 
 
+_PLACES = ("runs", "sequences", "captures", "incoming", "models", "damaged", "presets", "shares")
+"""Folders of a server in which tests leave something."""
 _ROOTS: dict[str, str] = {}
 """What addresses of each server begin with, and what they have to."""
 
@@ -104,16 +107,8 @@ def _leads_out(url: str) -> bool:
 
 
 @contextmanager
-def _serving(folder: Path, pictures: Path) -> Iterator[Served]:
-    """Start the program in a folder as a user does, and end it with the fits that it began.
-
-    Args:
-        folder: Where it runs.
-        pictures: Folder of small pictures that servers before it have drawn; what comes with the
-            program it need not draw again. It leaves its own there.
-    """
-    drawn = folder / "data" / "cache" / "previews"
-    shutil.copytree(pictures, drawn)
+def _serving(folder: Path) -> Iterator[Served]:
+    """Start the program in a folder as a user does, and end it with the fits that it began."""
     # Users start it where they work, and often have a package of this name there.
     (folder / "app").mkdir()
     (folder / "app" / "__init__.py").write_text("raise SystemExit('a package of the user')")
@@ -132,7 +127,7 @@ def _serving(folder: Path, pictures: Path) -> Iterator[Served]:
             return printed.read_text().count("\n") == 2
 
         until(has_printed, (folder / "log").read_text)
-        served = Served(*printed.read_text().split(), folder / "data")
+        served = Served(*printed.read_text().split(), folder / "data", server.pid)
         _ROOTS[served.base.removesuffix(BELOW)] = served.base
         yield served
     finally:
@@ -144,36 +139,23 @@ def _serving(folder: Path, pictures: Path) -> Iterator[Served]:
         finally:
             server.kill()
             server.wait()
-            for picture in drawn.glob("[!.]*.webp"):  # Hidden ones are half written.
-                shutil.copy2(picture, pictures)
 
 
 @pytest.fixture(scope="package")
-def _pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Small pictures that servers of these tests have drawn."""
-    return tmp_path_factory.mktemp("pictures")
-
-
-@pytest.fixture(scope="package")
-def _shared_server(tmp_path_factory: pytest.TempPathFactory, _pictures: Path) -> Iterator[Served]:
-    with _serving(tmp_path_factory.mktemp("shared_server"), _pictures) as served:
+def _shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with _serving(tmp_path_factory.mktemp("shared_server")) as served:
         yield served
 
 
 @pytest.fixture(scope="module")
-def own_server(tmp_path_factory: pytest.TempPathFactory, _pictures: Path) -> Iterator[Served]:
-    """A server for one file, for tests that look at everything that a server has."""
-    with _serving(tmp_path_factory.mktemp("own_server"), _pictures) as served:
-        yield served
-
-
-@pytest.fixture(scope="module")
-def served(_shared_server: Served) -> Served:
-    """The server of all files whose tests mind no runs of others; it draws its pictures once.
-
-    A file that minds them takes `own_server` in its place, by a fixture of this name.
-    """
-    return _shared_server
+def served(_shared_server: Served) -> Iterator[Served]:
+    """The server of all files, each of which leaves to the next what it found there."""
+    places = [_shared_server.data_dir / name for name in _PLACES]
+    found = {path for place in places for path in place.glob("*")}
+    yield _shared_server
+    for path in {path for place in places for path in place.glob("*")} - found:
+        end_processes(path, grace_s=0)
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 @pytest.fixture(scope="package")
@@ -263,7 +245,7 @@ def _opened_scene(browser: Browser) -> Iterator[_OpenedScene]:
 @pytest.fixture
 def shared_scene(
     browser: Browser,
-    _shared_server: Served,
+    served: Served,
     _opened_scene: _OpenedScene,
     request: pytest.FixtureRequest,
 ) -> Iterator[ScenePage]:
@@ -276,7 +258,7 @@ def shared_scene(
     if opened.scene is None:
         page = browser.new_context(viewport=_VIEWPORT, reduced_motion=_STILL).new_page()
         opened.complaints = _complaints_in(page.context)
-        page.goto(_shared_server.url)
+        page.goto(served.url)
         scene = ScenePage.opened_from(page)
         scene.pause()
         opened.scene = scene

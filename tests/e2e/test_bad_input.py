@@ -16,12 +16,6 @@ BUNDLED_RUN = Path(__file__).parents[2] / "sequences/runs/towel_fold_quick"
 ROLLOUT = "sequences/towel_fold/rollout.npy"
 
 
-@pytest.fixture(scope="module")
-def served(own_server):
-    """A server whose broken recordings and runs no other test gets to see."""
-    return own_server
-
-
 @pytest.fixture
 def page(browser: Browser, served) -> Iterator[Page]:
     """A tab beside damaged recordings and a damaged run; nothing in it may fail by itself."""

@@ -23,12 +23,6 @@ ROWS = "#runs tbody .name strong"
 RUN_COUNT = len(NAMES) + len(list(BUNDLED.glob("runs/*/run.yaml")))
 
 
-@pytest.fixture(scope="module")
-def served(own_server):
-    """A server without runs of other tests, which are counted here."""
-    return own_server
-
-
 @pytest.fixture
 def base(home: Page, served) -> str:
     """The server's address; two copies of the bundled run lie in its data folder."""

@@ -187,7 +187,7 @@ def seen_as(scene: ScenePage, color: tuple[int, int, int]) -> int:
 
 
 @pytest.fixture(scope="module")
-def seen(own_server) -> Run:
+def seen(served) -> Run:
     """The bundled run as one whose object has purple splats."""
     content = open_run(FolderCatalog(BUNDLED), "towel_fold_quick")
     surface, fitted = content.surface, content.fitted
@@ -197,10 +197,10 @@ def seen(own_server) -> Run:
     splats = replace(splats, color=np.tile(np.float32(PURPLE), (1_000, 1)))
     bundled = Run.open(BUNDLED / "runs" / "towel_fold_quick")
     run = Run.create(
-        own_server.data_dir / "runs" / "seen",
+        served.data_dir / "runs" / "seen",
         name="Seen",
         kind="reconstruction",
-        sequences=[str(own_server.data_dir / "sequences" / "towel_fold")],
+        sequences=[str(served.data_dir / "sequences" / "towel_fold")],
         config={},
     )
     with run.begin_attempt() as attempt:
@@ -210,9 +210,9 @@ def seen(own_server) -> Run:
     return run
 
 
-def test_a_scene_opens_on_the_surface_and_a_key_shows_splats(context, own_server, seen) -> None:
+def test_a_scene_opens_on_the_surface_and_a_key_shows_splats(context, served, seen) -> None:
     home = context.new_page()
-    home.goto(own_server.url)
+    home.goto(served.url)
     home.goto(f"{home.url.partition('?')[0].rstrip('/')}/runs/{seen.id}")
     home.locator("[data-open=run]").first.click()
     home.wait_for_url("**/live/**")

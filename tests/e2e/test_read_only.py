@@ -22,7 +22,7 @@ PAGES = (
     f"/runs/{RUN}",
     f"/runs/{TORN}",
     f"/runs/{RUN}/compare",
-    f"/runs/{RUN}/replay",
+    "/runs/towel_fold_quick/replay",
     "/sequences",
     "/sequences/towel_fold/check",
     "/launch",
@@ -68,12 +68,6 @@ _PRESS_ALL = """(names) => {
 _EMPTY_SCENE = re.compile("/viewer/")
 
 
-@pytest.fixture(scope="module")
-def served(own_server: Any) -> Any:
-    """A server with no runs of other tests, which would be offered too."""
-    return own_server
-
-
 @pytest.fixture
 def shown(served: Any) -> Iterator[None]:
     """A run that may be deleted, and one that is damaged."""
@@ -92,7 +86,7 @@ def shown(served: Any) -> Iterator[None]:
 @pytest.fixture
 def reader(browser: Browser, served: Any, shown: None) -> Iterator[Page]:
     """A tab of somebody who may only look, which may not even ask for anything else."""
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, reduced_motion="reduce")
     context.set_default_timeout(TIMEOUT_MS)
     context.add_init_script(FEWER_PICTURES)
     changes: list[str] = []

@@ -83,13 +83,10 @@ def test_the_printed_address_opens_and_the_server_ends_while_it_is_followed(
     assert (tmp_path / "data" / "runs").is_dir()
 
 
-def test_a_second_server_on_the_same_data_folder_says_who_has_it(
-    server: tuple[subprocess.Popen[str], str], tmp_path: Path
-) -> None:
-    process, _ = server
+def test_a_second_server_on_the_same_data_folder_says_who_has_it(served) -> None:
     command = [sys.executable, "-c", START, "serve", "--port", "0"]
     second = subprocess.run(
-        [*command, "--data-dir", str(tmp_path / "data")],
+        [*command, "--data-dir", str(served.data_dir)],
         capture_output=True,
         text=True,
         timeout=LIMIT_S,
@@ -97,5 +94,5 @@ def test_a_second_server_on_the_same_data_folder_says_who_has_it(
         cwd=Path(__file__).parents[2],
     )
     assert second.returncode == 1
-    assert f"process {process.pid}" in second.stderr
+    assert f"process {served.process_id}" in second.stderr
     assert "Traceback" not in second.stderr
