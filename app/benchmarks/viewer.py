@@ -290,9 +290,10 @@ class _Bench:
         return measure_splats(self._run, self._sequence, self._opened_browser(), seconds)
 
     def _live(self) -> dict[str, Any]:
-        from app.benchmarks.latency import measure_latency
+        from app.benchmarks.latency import MOVES, measure_latency
 
-        measured = measure_latency(self._run, self._sequence, device="cpu")
+        moves = min(MOVES, self._effort.moves)
+        measured = measure_latency(self._run, self._sequence, device="cpu", moves=moves)
         kind = measured["kinds"]["stiffness, substeps automatic"]
         named = ("sequence_frames_per_s", "steered")
         return {**kind, **{name: measured[name] for name in named}}

@@ -11,7 +11,7 @@ import pytest
 from scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_DRAWING
 
 from app import cli
-from app.benchmarks import browser, streams, viewer
+from app.benchmarks import browser, latency, streams, viewer
 from app.benchmarks.parts import PARTS
 from app.benchmarks.scenes import HEAVY, HEAVY_ARROWS, HEAVY_NODES, make_heavy_run, make_many_runs
 from app.benchmarks.served import Served, ServerFailedError
@@ -35,6 +35,7 @@ def little(monkeypatch: pytest.MonkeyPatch) -> None:
     effort = viewer._Effort(moves=2, visits=1, seconds=1.0, runs=20)
     monkeypatch.setattr(viewer, "_QUICK", effort)
     monkeypatch.setattr(streams, "_SETTLING_S", 0.3)
+    monkeypatch.setattr(latency, "_STEERED", 60)
     monkeypatch.setattr(browser, "_COUNTED_MS", 500.0)
     # Without a graphics card every picture and every pixel costs, and windows cost more.
     monkeypatch.setattr(browser, "BROWSERS", browser.BROWSERS[::-1])
