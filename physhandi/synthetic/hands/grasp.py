@@ -1,6 +1,6 @@
 """Inverse kinematics of the true hand: poses that bring the fingertips to given targets."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -44,15 +44,18 @@ POINTING = np.array([0.3, 0.0, 0.0, 0.3, 0.5, 0.5, 0.0, 0.25] + [1.2, 0.0, 1.5] 
 """Joints of a hand whose index finger points while the others are curled [rad]."""
 
 
-def bend_of(joints: Float[ndarray, " 17"]) -> Float[ndarray, "bone 3"]:
-    """Bend the bones by 17 joint angles: five of the thumb, three of each other finger [rad]."""
-    bend = np.zeros((BONE_COUNT, 3))
-    bend[1] = joints[:3]
-    bend[2:4, 0] = joints[3:5]
-    for number, (knuckle, spread, middle) in enumerate(joints[5:].reshape(4, 3)):
-        root = 4 + 3 * number
-        bend[root, :2] = knuckle, spread
-        bend[root + 1 : root + 3, 0] = middle, _LAST_JOINT * middle
+def bend_of(joints: Float[ndarray, "*pose 17"]) -> Float[ndarray, "*pose bone 3"]:
+    """Bend the bones by 17 joint angles: five of the thumb, three of each other finger [rad].
+
+    The latter are flexion and spread of the knuckle and flexion of the middle joint.
+    """
+    bend = np.zeros((*joints.shape[:-1], BONE_COUNT, 3))
+    bend[..., 1, :] = joints[..., :3]
+    bend[..., 2:4, 0] = joints[..., 3:5]
+    fingers = joints[..., 5:].reshape(*joints.shape[:-1], 4, 3)
+    bend[..., 4::3, :2] = fingers[..., :2]
+    bend[..., 5::3, 0] = fingers[..., 2]
+    bend[..., 6::3, 0] = _LAST_JOINT * fingers[..., 2]
     return bend
 
 
@@ -121,11 +124,10 @@ def reach(
     low = np.concatenate([np.full(3, -_TURN_RANGE), *reach_low])
     high = np.concatenate([np.full(3, _TURN_RANGE), *reach_high])
 
-    def pose_of(value: ndarray) -> TrueHandPose:
-        turn = Rotation.from_rotvec(value[:3]) * palm
-        return TrueHandPose(
-            orientation=turn.as_rotvec(), position=value[3:6].copy(), bend=bend_of(value[6:])
-        )
+    def parts_of(value: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+        turn = Rotation.from_rotvec(value[..., :3].reshape(-1, 3)) * palm
+        orientation = turn.as_rotvec().reshape(*value.shape[:-1], 3)
+        return orientation, value[..., 3:6].copy(), bend_of(value[..., 6:])
 
     bones = [tip.bone for tip in tips.values()]
     ends = np.array([tip.end for tip in tips.values()])[..., None]
@@ -137,23 +139,31 @@ def reach(
     heel = hand.rest_keypoint[:2]
 
     def residuals(value: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-        transform = hand.bone_transforms(pose_of(value))
-        height = heel @ transform[0, 2, :3] + transform[0, 2, 3]
+        transform = hand.transforms_of(*parts_of(value))
+        height = (heel @ transform[..., 0, 2, :3, None])[..., 0] + transform[..., 0, 2, 3, None]
         low = np.maximum(floor + _HEEL - height, 0.0)
-        transform = transform[bones]
-        misses = (transform[:, :3, :3] @ ends)[..., 0] + transform[:, :3, 3] - goal
+        transform = transform[..., bones, :, :]
+        misses = (transform[..., :3, :3] @ ends)[..., 0] + transform[..., :3, 3] - goal
         if along is None:
-            return misses, low, np.zeros((0, 3))
-        return misses, low, (transform[pads, :3, :3] @ lines[pads])[..., 0] - along
+            return misses, low, np.zeros((*value.shape[:-1], 0, 3))
+        return misses, low, (transform[..., pads, :3, :3] @ lines[pads])[..., 0] - along
 
     def cost(value: ndarray) -> ndarray:
         misses, low, slants = residuals(value)
         stray = (value - guess) / scale
-        off = np.concatenate([misses.ravel(), low]) / _TIP_SCALE
-        return np.concatenate([off, slants.ravel() / _SLANT, stray])
+        flat = (*value.shape[:-1], -1)
+        off = np.concatenate([misses.reshape(flat), low], axis=-1) / _TIP_SCALE
+        return np.concatenate([off, slants.reshape(flat) / _SLANT, stray], axis=-1)
 
-    first = np.clip(guess, low, high)
-    solution = least_squares(cost, first, bounds=(low, high), ftol=1e-4, xtol=1e-4, max_nfev=60)
+    solution = least_squares(
+        cost,
+        np.clip(guess, low, high),
+        lambda value: _slopes(cost, value, low, high),
+        bounds=(low, high),
+        ftol=1e-4,
+        xtol=1e-4,
+        max_nfev=60,
+    )
     error = np.linalg.norm(residuals(solution.x)[0], axis=1)[pads]
     worst = int(error.argmax())
     if error[worst] > _TIP_ERROR:
@@ -162,7 +172,29 @@ def reach(
             f"The {hand.side} hand cannot reach: its {finger} finger stays "
             f"{error[worst] * 1000:.0f} mm short. Choose a smaller object or another seed."
         )
-    return pose_of(solution.x)
+    turn, place, bend = parts_of(solution.x)
+    return TrueHandPose(orientation=turn, position=place, bend=bend)
+
+
+def _slopes(
+    cost: Callable[[ndarray], ndarray],
+    value: Float[ndarray, " number"],
+    low: Float[ndarray, " number"],
+    high: Float[ndarray, " number"],
+) -> Float[ndarray, "cost number"]:
+    """Take the difference quotients that SciPy takes, but all at once.
+
+    Args:
+        cost: Gives the costs of many values.
+        value: Where they are taken.
+        low: Least of each number.
+        high: Most of each number.
+    """
+    step = np.sqrt(np.finfo(float).eps) * np.maximum(1.0, np.abs(value))
+    step = np.where(value >= 0, step, -step)
+    step = np.where((value + step < low) | (value + step > high), -step, step)
+    here, *there = cost(np.vstack([value, value + np.diag(step)]))
+    return ((np.array(there) - here) / ((value + step) - value)[:, None]).T
 
 
 def _first_place(

@@ -142,19 +142,28 @@ class TrueHand:
         turn = np.asarray(pose.bend, dtype=np.float64)
         if turn.shape != (BONE_COUNT, 3) or turn[0].any():
             raise ValueError("The bend of a hand has 16 rows of 3, and bone 0 stays zero.")
-        own = Rotation.from_rotvec(turn).as_matrix()
+        return self.transforms_of(pose.orientation, pose.position, turn)
+
+    def transforms_of(
+        self,
+        orientation: Float[ndarray, "*pose 3"],
+        position: Float[ndarray, "*pose 3"],
+        bend: Float[ndarray, "*pose bone 3"],
+    ) -> Float[ndarray, "*pose bone 4 4"]:
+        """Compute `bone_transforms` of many poses; what is given means what it means in a pose."""
+        own = _matrices(bend)
         own = self.bone_axes @ own @ self.bone_axes.transpose(0, 2, 1)
-        transform = np.tile(np.eye(4), (BONE_COUNT, 1, 1))
-        transform[0, :3, :3] = Rotation.from_rotvec(pose.orientation).as_matrix()
-        transform[0, :3, 3] = pose.position
+        transform = np.tile(np.eye(4), (*bend.shape[:-1], 1, 1))
+        transform[..., 0, :3, :3] = _matrices(orientation)
+        transform[..., 0, :3, 3] = position
         for link in (1, 2, 3):  # of all five fingers at once
             bones = slice(link, BONE_COUNT, 3)
-            above = transform[list(self.bone_parent[bones])]
+            above = transform[..., list(self.bone_parent[bones]), :, :]
             origin = self.bone_origin[bones, :, None]
-            rotation = above[:, :3, :3] @ own[bones]
-            place = above[:, :3, :3] @ origin + above[:, :3, 3:]
-            transform[bones, :3, :3] = rotation
-            transform[bones, :3, 3:] = place - rotation @ origin
+            rotation = above[..., :3, :3] @ own[..., bones, :, :]
+            place = above[..., :3, :3] @ origin + above[..., :3, 3:]
+            transform[..., bones, :3, :3] = rotation
+            transform[..., bones, :3, 3:] = place - rotation @ origin
         return transform
 
     def pose(self, pose: TrueHandPose) -> PosedHand:
@@ -248,6 +257,12 @@ def _fit_capsule(bone: int, start: ndarray, end: ndarray, around: ndarray) -> Ca
     distance = np.sort(np.linalg.norm(around - foot, axis=1)[beside])
     nearest = distance if bone else distance[: max(len(distance) // 4, 1)]
     return Capsule(bone=bone, start=start, end=end, radius=float(np.median(nearest)))
+
+
+def _matrices(vector: Float[ndarray, "*pose 3"]) -> Float[ndarray, "*pose 3 3"]:
+    """Compute the matrices of rotation vectors [rad]."""
+    matrix = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
+    return matrix.reshape(*vector.shape, 3)
 
 
 def _mirror(side: Side) -> Float[ndarray, " 3"]:
