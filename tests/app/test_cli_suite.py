@@ -139,7 +139,8 @@ def test_the_tiny_suite_is_made_by_one_command_and_taken_up_by_the_next(
     tiny = replace(
         tiny,
         methods=("static", "quick", FLOOR, "oracle_hand"),
-        recording={**tiny.recording, "frames": 12},
+        seeds=(3,),  # MuJoCo lifts its cloth in two thirds of the time.
+        recording={**tiny.recording, "frames": 14},
     )
     monkeypatch.setitem(SUITES, "tiny", tiny)
     # The process that makes the sequence fills the only cell, too.
