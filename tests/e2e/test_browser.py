@@ -228,29 +228,6 @@ def test_values_typed_key_by_key_keep_their_sign_and_factors_are_typed_as_such(
     expect(scene.field("stiffness")).to_have_value("×1.0")
 
 
-def test_another_tab_is_left_alone(shared_scene: ScenePage, served):
-    scene, page = shared_scene, shared_scene.page.context.new_page()
-    page.goto(served.url)
-    other = ScenePage.opened_from(page)
-    other.pause()
-    assert other.page.url != scene.page.url
-    other.until(lambda: other.difference() == 0, "the fitted rollout")
-    springs, frame, radius = other.springs(), other.value("Frame"), other.value("δ object [mm]")
-
-    scene.set("δ object [mm]", 60)
-    scene.until(lambda: (scene.difference() or 0) > 0, "another rollout")
-
-    scene.until(lambda: scene.springs()[0] not in {None, springs[0]}, "other springs")
-    assert (*other.rollout(), other.value("Frame")) == (*springs, 0, frame)
-    assert other.value("δ object [mm]") == radius
-    # The other tab is not merely frozen: it answers its own user.
-    other.tab("Play")
-    other.press("1 ▶")
-    other.until(lambda: other.value("Frame") != frame, "a step by one frame")
-    page.close()
-    scene.press("Reset")
-
-
 def test_a_run_page_exports_the_rollout(home, fitted, tmp_path, picture):
     home.locator(f"#runs [data-run={fitted.id}] a").first.click()
     expect(home.locator("h1")).to_have_text(fitted.name)

@@ -76,25 +76,34 @@ def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, ser
     scene.go(FRAME)
     scene.set("stiffness", 0.1)
     difference, address = scene.new_difference("another rollout"), scene.page.url
+    shown = *scene.springs(), difference
+    radius = scene.value("δ object [mm]")
 
     second = scene.page.context.new_page()
     second.goto(address)
     copied = ScenePage(second)
-    copied.until(lambda: copied.difference() == difference, "the same rollout")
+    copied.until(lambda: copied.rollout() == shown, "the same rollout")
     original = address.partition("?")[0]
     copied.until(lambda: second.url.partition("?")[0] != original, "an address of its own")
     copied.until(lambda: copied.value("Frame") == copied.frame() == FRAME, "the same frame")
-    copied.set("stiffness", 3)
+    copied.set("δ object [mm]", 60)
     copied.new_difference("a rollout of its own", difference)
-    scene.until(lambda: scene.difference() == difference, "the first tab as it was")
+    copied.until(lambda: copied.springs()[0] not in {None, shown[0]}, "springs of its own")
+    scene.until(lambda: scene.rollout() == shown, "the first tab as it was")
+    assert (scene.value("Frame"), scene.value("δ object [mm]")) == (FRAME, radius)
+    # It is not merely frozen: it answers its own user.
+    scene.tab("Play")
+    scene.press("1 ▶")
+    scene.until(lambda: scene.value("Frame") == FRAME + 1, "a step by one frame")
+    scene.tab("Physics")
 
     own = second.url.partition("?")[0]  # What follows is the state, which changes.
     second.reload()
     copied.until(lambda: copied.has("object springs"), "the scene again")
     assert second.url.partition("?")[0] == own
-    copied.until(lambda: copied.value("stiffness") == 3, "its stiffness")
+    copied.until(lambda: copied.value("δ object [mm]") == 60, "its radius")
 
-    stranger = browser.new_context().new_page()
+    stranger = browser.new_context(reduced_motion="reduce").new_page()
     stranger.set_default_timeout(TIMEOUT_MS)
     stranger.goto(served.url)
     assert stranger.goto(address).status == 404
