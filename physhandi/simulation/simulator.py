@@ -16,7 +16,7 @@ from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.cuda import CudaEngine
 from physhandi.simulation.engines.graph import LaunchGraph, SpringSums
 from physhandi.simulation.engines.rod_force import RodForce
-from physhandi.simulation.kernels.integration import integrate_nodes
+from physhandi.simulation.kernels.integration import SPEED_LIMIT, integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SpringMassModel, checked_control
@@ -26,8 +26,6 @@ from physhandi.simulation.rod import Rod
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.stability import explain_divergence
 
-SPEED_LIMIT = 50.0
-"""A node faster than this has diverged [m/s]."""
 NO_DIVERGENCE = np.iinfo(np.int32).max
 """What `Simulator.first_divergence` holds as long as no node has diverged."""
 _WORLD: Any = World
@@ -429,7 +427,6 @@ def world_array(parameters: Sequence[SimulationParameters]) -> ndarray:
             "self_restitution": each.self_restitution,
             "self_friction": each.self_friction,
             "collides_rest_neighbors": each.collides_rest_neighbors,
-            "speed_limit": SPEED_LIMIT,
         }
         for name, value in values.items():
             worlds[name][index] = value

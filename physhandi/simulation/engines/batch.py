@@ -8,7 +8,7 @@ losses. Few candidates are moved in one launch a frame instead: side by side
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,9 @@ from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
 from physhandi.simulation.engines.side_by_side import FEW_OWN, SideBySide
 from physhandi.simulation.kernels.batch import (
+    BLOCK_NODES,
     CANDIDATE_FIELDS,
+    NO_GROUND,
     block_threads,
     make_batch_kernel,
     note_divergence,
@@ -44,14 +46,14 @@ from physhandi.simulation.kernels.batch_losses import (
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import checked_control
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.simulator import SPEED_LIMIT, Simulator
+from physhandi.simulation.simulator import Simulator
 
 _BUSY_WARPS = 24
 """Warps that keep a multiprocessor busy."""
 _BUSY_THREADS, _MOST_SLICES = 2**18, 64
 """Threads that keep a GPU busy, and most slices of an object's surface to get as many."""
-BLOCK_NODES = 4
-"""Consecutive nodes in memory that are also neighbours in space."""
+_CACHED_BYTES = 40e6
+"""States that stay in a GPU's second-level cache, out of 50 MB; what does not waits for memory."""
 batch_kernel = lru_cache(maxsize=None)(make_batch_kernel)
 _COMMON = ("rest_length_floor", "virtual_rest_length_floor", "frame_rate", "frame_duration")
 
@@ -247,7 +249,7 @@ class Population:
         # Candidates with similar radii share a group, so that few of them wait for others.
         reach = np.array([(p.connection_radius, p.virtual_connection_radius) for p in parameters])
         self._order = np.lexsort(reach.T[::-1])
-        self._model_node = bisect_nodes(master.object_node, max(1, self._nodes // BLOCK_NODES))[0]
+        self._model_node = _in_blocks(master.object_node)
         self.blocks: BatchBlocks | None = None
         if in_blocks:
             sharing = [parameters[i] for i in self._lanes(GROUP_WIDTH)]
@@ -258,12 +260,10 @@ class Population:
         lanes = self._lanes(self._width)
         self._groups = len(lanes) // self._width
         self._parts = _warps_of_a_node(self._groups * self._nodes, device)
-        numbers = [
-            [_number(parameters[i], name, substeps) for i in lanes] for name in CANDIDATE_FIELDS
-        ]
-        table = np.array(numbers, dtype=np.float32).reshape(
-            len(CANDIDATE_FIELDS), self._groups, self._width
-        )
+        table = np.array(
+            [[_number(parameters[i], name, substeps) for i in lanes] for name in CANDIDATE_FIELDS],
+            dtype=np.float32,
+        ).reshape(len(CANDIDATE_FIELDS), self._groups, self._width)
         group_reach = reach[lanes].reshape(self._groups, self._width, 2).max(axis=1)
         limit = np.array([(p.connection_radius, p.max_neighbors) for p in parameters])
         group_limit = limit[lanes].reshape(self._groups, self._width, 2).min(axis=1)
@@ -273,11 +273,15 @@ class Population:
             self._array(table.swapaxes(0, 1).ravel(), wp.float32),
             self._array(group_reach.T.astype(np.float32), wp.float32),
         ]
-        if self.blocks is None:
-            self._inputs += self._entries(master, rest_length, group_reach[:, 0], group_limit)
         virtual, start = self._virtual(master)
+        if self.blocks is None:
+            limits = group_reach[:, 0], group_limit
+            self._inputs += self._entries(master, rest_length, *limits, np.diff(start))
         control = master.spring_nodes[virtual].max(axis=1) - self._nodes
-        self._inputs += [start, *self._springs(master, rest_length, control, virtual)]
+        self._inputs += [
+            self._array(start.astype(np.int32), wp.int32),
+            *self._springs(master, rest_length, control, virtual),
+        ]
         self._held_rank = self._inputs[-1]
         self._rank = master.rank[virtual]
         self._attached = master.attached[virtual - master.object_spring_count]
@@ -290,9 +294,11 @@ class Population:
         self._start = [
             self._array(value, wp.vec3) for value in (master.object_node, master.initial_velocity)
         ]
-        self._diverged = wp.zeros(len(lanes), dtype=wp.int32, device=device)
-        self._diverged_frame = wp.zeros(len(lanes), dtype=wp.int32, device=device)
-        self._frame = LaunchGraph(self._launch_frame, device)
+        self._diverged, self._diverged_frame = (
+            wp.zeros(len(lanes), dtype=wp.int32, device=device) for _ in range(2)
+        )
+        self._stream = wp.Stream(device)
+        self._frame_graphs = self._graphs_of_groups()
 
     def rollout(self, control: Float32[ndarray, "frame control 3"]) -> BatchRollout:
         """Simulate all frames; the host waits once, at the end."""
@@ -354,7 +360,13 @@ class Population:
     def _advance(self) -> None:
         """Advance all candidates by a frame."""
         if self.blocks is None:
-            self._frame.replay()
+            # Of two streams each has work while the other one begins or ends a launch.
+            streams = [self._device.stream, self._stream]
+            streams[1].wait_stream(streams[0])
+            for turn, frame in enumerate(self._frame_graphs):
+                with wp.ScopedStream(streams[turn % 2], sync_enter=False):
+                    frame.replay()
+            streams[0].wait_stream(streams[1])
             return
         self.blocks.advance(
             self._substeps,
@@ -382,19 +394,41 @@ class Population:
         ordered[self._order] = by_lane
         return ordered
 
-    def _launch_frame(self) -> None:
-        threads = 32 * self._parts * self._groups * self._nodes
+    def _graphs_of_groups(self) -> list[LaunchGraph]:
+        """Divide the groups into parts that take a whole frame one after the other.
+
+        Their states stay in the second-level cache then.
+        """
+        at_once = self._groups
+        if self._parts == 1:
+            of_group = 2 * self._state[0].capacity / self._groups
+            at_once = max(1, int(_CACHED_BYTES / of_group) // 2)
+        return [
+            LaunchGraph(
+                partial(self._launch_frame, first, min(first + at_once, self._groups)),
+                self._device,
+            )
+            for first in range(0, self._groups, at_once)
+        ]
+
+    def _launch_frame(self, first: int, end: int) -> None:
+        """Launch all substeps of a frame for some groups."""
+        places = self._nodes
+        if self._parts == 1:
+            places = -(-self._nodes // BLOCK_NODES) * BLOCK_NODES
         for substep in range(self._substeps):
             before, after = self._state[substep % 2], self._state[(substep + 1) % 2]
             fraction = (substep + 1) / self._substeps
             self._launch(
                 batch_kernel(self._each, self._parts),
-                threads,
-                [self._groups, fraction, *self._inputs, *self._controls, before],
+                32 * self._parts * (end - first) * places,
+                [first, places, fraction, *self._inputs, *self._controls, before],
                 [after, self._diverged],
             )
         if self._substeps % 2:
-            wp.copy(self._state[0], self._state[1])
+            of_group = 6 * self._width * self._nodes
+            place, count = first * of_group, (end - first) * of_group
+            wp.copy(*self._state, dest_offset=place, src_offset=place, count=count)
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(
@@ -412,11 +446,15 @@ class Population:
         rest_length: ndarray,
         reach: Float[ndarray, " group"],
         limit: Float[ndarray, "group 2"],
+        held: Int[ndarray, " node"],
     ) -> list[wp.array]:
-        """List object half-edges, the nearest neighbor of a node first, and where groups end.
+        """List object half-edges, the nearest neighbor of a node first, and which a group has.
 
-        Up to a certain one every candidate of a group has all of them: those before the first
-        that is beyond the group's smallest radius or neighbor limit.
+        For each group and node: where its half-edges begin, where those end that every candidate
+        has, where all end, and how many virtual springs hold the node. Every candidate has those
+        before the first that is beyond the group's smallest radius or neighbor limit. A half-edge
+        says how many bytes after the state of a group's first node that of its other end is, and
+        one over the rest length. Then its length and rank.
         """
         ends = self._numbered(master.spring_nodes[: master.object_spring_count])
         spring = np.tile(np.arange(len(ends)), 2)
@@ -431,19 +469,24 @@ class Population:
             first = end[-1].copy()
             np.minimum.at(first, source[doubtful], doubtful)
             certain.append(first)
+        half_edge = np.empty((len(spring), 2), dtype=np.int32)
+        half_edge[:, 0] = 4 * 6 * self._width * other
+        half_edge[:, 1] = (1.0 / rest_length[spring]).astype(np.float32).view(np.int32)
+        place = np.stack(np.broadcast_arrays(start[:-1], certain, end, held), axis=-1)
         return [
-            self._array(start.astype(np.int32), wp.int32),
-            self._array(np.array(certain, dtype=np.int32), wp.int32),
-            self._array(np.array(end, dtype=np.int32), wp.int32),
-            *self._springs(master, rest_length, other, spring),
+            self._array(place.reshape(-1, 4).astype(np.int32), wp.vec4i),
+            self._array(half_edge, wp.vec2i),
+            self._array(np.stack([length, rank], axis=1).astype(np.float32), wp.vec2),
         ]
 
-    def _virtual(self, master: MasterTopology) -> tuple[Int[ndarray, " virtual"], wp.array]:
+    def _virtual(
+        self, master: MasterTopology
+    ) -> tuple[Int[ndarray, " virtual"], Int[ndarray, " node_1"]]:
         """Order virtual springs by object node, the shortest first; and where each node's begin."""
         spring = np.arange(master.object_spring_count, len(master.length))
         node = self._numbered(master.spring_nodes[spring].min(axis=1))
         start, order = self._sorted(node, master.length[spring])
-        return spring[order], self._array(start.astype(np.int32), wp.int32)
+        return spring[order], start
 
     def _numbered(self, node: Int[ndarray, "*ends"]) -> Int[ndarray, "*ends"]:
         """Turn the model's numbers of object nodes into those of the batch."""
@@ -483,6 +526,15 @@ class Population:
         return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self._device)
 
 
+def _in_blocks(node: Float32[ndarray, "node 3"]) -> Int[ndarray, " node"]:
+    """Order nodes so that each block of `BLOCK_NODES` is compact; the last one may be shorter."""
+    blocks = -(-len(node) // BLOCK_NODES)
+    # What fills the last block lies beyond all others along every axis.
+    filling = np.tile(node.max(axis=0), (blocks * BLOCK_NODES - len(node), 1))
+    order = bisect_nodes(np.concatenate([node, filling]), blocks)[0]
+    return order[order < len(node)]
+
+
 def _warps_of_a_node(tasks: int, device: Any) -> int:
     """Return how many warps share a node.
 
@@ -500,10 +552,8 @@ def _number(parameters: SimulationParameters, name: str, substeps: int) -> float
     derived = {
         "dt": duration / substeps,
         "velocity_loss": parameters.replace(substeps_per_frame=substeps).velocity_loss(),
-        "has_ground": float(height is not None),
-        "ground_height": 0.0 if height is None else height,
+        "ground_height": NO_GROUND if height is None else height,
         "control_rate": parameters.simulated_frame_rate * parameters.use_control_velocity,
-        "speed_limit": SPEED_LIMIT,
         "stiffness": scale * parameters.stiffness,
         "virtual_stiffness": scale * parameters.virtual_stiffness,
         "damping": parameters.damping * (parameters.stiffness > 0.0),

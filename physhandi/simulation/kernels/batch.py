@@ -7,7 +7,7 @@ nothing. State is laid out as [group][node][x y z vx vy vz][candidate of the gro
 
 import warp as wp
 
-from physhandi.simulation.kernels.contacts import advance
+from physhandi.simulation.kernels.contacts import advance, touches_ground
 from physhandi.simulation.kernels.cuda_frame import control_position, control_velocity, pull
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast
 from physhandi.simulation.kernels.world import World
@@ -18,12 +18,10 @@ CANDIDATE_FIELDS = (
     "dt",
     "velocity_loss",
     "gravity",
-    "has_ground",
     "ground_height",
     "restitution",
     "friction",
     "control_rate",
-    "speed_limit",
     "stiffness",
     "damping",
     "connection_radius",
@@ -34,20 +32,31 @@ CANDIDATE_FIELDS = (
     "virtual_max_neighbors",
 )
 """Rows of the candidates' numbers."""
-_LEAST_THREADS = 256
+NO_GROUND = -1.0e6
+"""Height of the ground of a candidate that has none [m]."""
+BLOCK_NODES = 16
+"""Nodes of a block of threads where a warp has a node of its own."""
 
 
 # What follows is `cuda_frame.pull` summed over a node's springs, for several candidates a thread.
 # Wide loads at fixed offsets, which Warp's strided arrays do not give, make it 2.5 times as fast.
-# Springs that all candidates of the group have come first and need no question. The root of
-# `intrinsics` is inlined with the sum of squares kept away from zero.
+# Springs that all candidates of the group have come first and need no question. Instructions bound
+# this kernel, so the root is not refined: its error is at most 1.3e-7 of the length, while rounding
+# one coordinate of 0.2 m is 7e-7 of a length of 10 mm.
 _SUM_SPRINGS = """
 #if defined(__CUDA_ARCH__)
     typedef WIDE wide;
-    const wide* states = (const wide*)state.data + group_first;
-    const float4* lengths = (const float4*)entry_length.data;
-    const auto pull = [&](const float4 length, const int rank, const bool is_certain) {
-        const wide* place = states + 192 * __float_as_int(length.w);
+    const char* const states = (const char*)((const wide*)state.data + group_first);
+    const uint2* const half_edges = (const uint2*)entry.data;
+    const float2* const limits = (const float2*)entry_limit.data;
+    // Numbers of the candidates, by rows of `CANDIDATE_FIELDS`.
+    const auto number_of = [&](const int row) {
+        return __ldg((const wide*)number.data + numbers + 32 * row);
+    };
+    const wide stiffness = number_of(STIFFNESS), damping = number_of(STIFFNESS + 1);
+    const auto pull = [&](const uint2 half_edge, const int limited) {
+        const wide* const place = (const wide*)(states + half_edge.x);
+        const float inverse_rest = __uint_as_float(half_edge.y);
         wide found[6];
         #pragma unroll
         for (int k = 0; k < 6; ++k) found[k] = __ldg(place + 32 * k);
@@ -62,30 +71,25 @@ _SUM_SPRINGS = """
             const float squared = fmaf(dx, dx, fmaf(dy, dy, fmaf(dz, dz, 1.0e-20f)));
             float inverse;
             asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(squared));
-            float now = squared * inverse;
-            now = fmaf(0.5f * inverse, fmaf(-now, now, squared), now);
             const float rate = inverse * fmaf(ux, dx, fmaf(uy, dy, uz * dz));
-            const float strain = fmaf(now, length.z, -1.0f);
-            const float tension = fmaf(material.data[0][i], strain, material.data[1][i] * rate);
-            const bool exists = is_certain
-                || (length.x < material.data[2][i] && rank < material.data[3][i]);
-            const float scale = exists ? tension * inverse : 0.0f;
+            const float shortened = ((const float*)&stiffness)[i] * (inverse_rest - inverse);
+            float scale = fmaf(((const float*)&damping)[i] * rate, inverse, shortened);
+            if (limited >= 0) {
+                const float2 limit = __ldg(limits + limited);
+                const wide radius = number_of(STIFFNESS + 2), most = number_of(STIFFNESS + 3);
+                if (!(limit.x < ((const float*)&radius)[i] && limit.y < ((const float*)&most)[i]))
+                    scale = 0.0f;
+            }
             force.data[0][i] = fmaf(scale, dx, force.data[0][i]);
             force.data[1][i] = fmaf(scale, dy, force.data[1][i]);
             force.data[2][i] = fmaf(scale, dz, force.data[2][i]);
         }
     };
-    // The next spring is read while this one pulls.
     int e = begin + part;
-    float4 next = e < certain_end ? __ldg(lengths + e) : float4();
     #pragma unroll 4
-    for (; e < certain_end; e += PARTS) {
-        const float4 length = next;
-        if (e + PARTS < certain_end) next = __ldg(lengths + e + PARTS);
-        pull(length, 0, true);
-    }
+    for (; e < certain_end; e += PARTS) pull(__ldg(half_edges + e), -1);
     #pragma unroll 1
-    for (; e < end; e += PARTS) pull(__ldg(lengths + e), __ldg(entry_rank.data + e), false);
+    for (; e < end; e += PARTS) pull(__ldg(half_edges + e), e);
 #endif
     return force;
 """
@@ -105,10 +109,11 @@ _ADD_PARTS = """
 #endif
     return force;
 """
+# Warp's arrays are strided, and reading one number of them takes ten instructions.
 _LOAD = """
     FLOATS value;
 #if defined(__CUDA_ARCH__)
-    const WIDE wide = __ldg((const WIDE*)data.data + place);
+    const WIDE wide = __ldg((const WIDE*)data.data + first + offset);
     for (int i = 0; i < COUNT; ++i) value[i] = ((const float*)&wide)[i];
 #endif
     return value;
@@ -117,14 +122,58 @@ _STORE = """
 #if defined(__CUDA_ARCH__)
     WIDE wide;
     for (int i = 0; i < COUNT; ++i) ((float*)&wide)[i] = value[i];
-    ((WIDE*)data.data)[place] = wide;
+    __stcg((WIDE*)data.data + first + offset, wide);  // No thread of this launch reads it.
+#endif
+"""
+# `wp.tid` divides by what a tile has of threads, which is one here.
+_THREAD = """
+#if defined(__CUDA_ARCH__)
+    return (int)((blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x * blockDim.x
+        + blockIdx.x * blockDim.x + threadIdx.x);
+#else
+    return 0;
+#endif
+"""
+_READ = """
+#if defined(__CUDA_ARCH__)
+    return __ldg(data.data + index);
+#else
+    return 0;
+#endif
+"""
+_READ_FOUR = """
+#if defined(__CUDA_ARCH__)
+    const int4 four = __ldg((const int4*)data.data + index);
+    return wp::vec4i(four.x, four.y, four.z, four.w);
+#else
+    return wp::vec4i();
 #endif
 """
 
 
+@wp.func_native(snippet=_THREAD)
+def number_of_thread() -> int:
+    """Return the number of the thread in the launch."""
+
+
+@wp.func_native(snippet=_READ)
+def read_int(data: wp.array[int], index: int) -> int:
+    """Read a number of a contiguous array."""
+
+
+@wp.func_native(snippet=_READ)
+def read_float(data: wp.array[float], index: int) -> float:
+    """Read a number of a contiguous array."""
+
+
+@wp.func_native(snippet=_READ_FOUR)
+def read_record(data: wp.array[wp.vec4i], index: int) -> wp.vec4i:
+    """Read a record of four numbers of a contiguous array."""
+
+
 def block_threads(parts: int) -> int:
     """Give the threads of a block whose nodes are shared by so many warps each."""
-    return max(_LEAST_THREADS, 32 * parts)
+    return 32 * (BLOCK_NODES if parts == 1 else parts)
 
 
 def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
@@ -132,7 +181,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
 
     Args:
         count: Candidates of each thread: 1 or 2.
-        parts: Warps that share the springs of a node: 1, or a whole block of 8 or more.
+        parts: Warps that share the springs of a node: 1, or a whole block of 8, 16 or 32.
     """
     if parts not in {1, 8, 16, 32}:
         raise ValueError(f"{parts} warps cannot share a node.")
@@ -144,22 +193,26 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
     def native(snippet: str) -> str:
         snippet = snippet.replace("FLOATS", f"wp::vec_t<{count}, wp::float32>")
         return (
-            snippet.replace("WIDE", wide).replace("COUNT", str(count)).replace("PARTS", str(parts))
+            snippet.replace("WIDE", wide)
+            .replace("COUNT", str(count))
+            .replace("PARTS", str(parts))
+            .replace("STIFFNESS", str(CANDIDATE_FIELDS.index("stiffness")))
         )
 
     @wp.func_native(snippet=native(_SUM_SPRINGS))
     def sum_springs(
         state: wp.array[float],
         group_first: int,
-        entry_length: wp.array[wp.vec4],
-        entry_rank: wp.array[int],
+        entry: wp.array[wp.vec2i],
+        entry_limit: wp.array[wp.vec2],
         begin: int,
         certain_end: int,
         end: int,
         part: int,
+        number: wp.array[float],
+        numbers: int,
         x: vectors,
         v: vectors,
-        material: materials,
         force: vectors,
     ) -> vectors:
         """Sum the object springs of one node for several candidates."""
@@ -169,29 +222,28 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         """Sum what the warps of a block found."""
 
     @wp.func_native(snippet=native(_LOAD))
-    def load(data: wp.array[float], place: int) -> floats:
-        """Load the numbers of a thread's candidates."""
+    def load(data: wp.array[float], first: int, offset: int) -> floats:
+        """Load the numbers of a thread's candidates, a fixed offset after the first ones."""
 
     @wp.func_native(snippet=native(_STORE))
-    def store(data: wp.array[float], place: int, value: floats):
-        """Store the numbers of a thread's candidates."""
+    def store(data: wp.array[float], first: int, offset: int, value: floats):
+        """Store the numbers of a thread's candidates, a fixed offset after the first ones."""
 
-    # Registers for three blocks of the common size: fewer spill, more leave places empty.
-    bounds = (block_threads(parts), 3 if parts == 1 else 1)
+    # Registers for two blocks of the common size: fewer spill, more leave places empty.
+    bounds = (block_threads(parts), 2 if parts == 1 else 1)
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds)
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds, grid_stride=False)
     def advance_batch(
-        groups: int,
+        first_group: int,
+        places: int,
         fraction: float,
         # Model:
         clearance: wp.array[float],
         number: wp.array[float],
         reach: wp.array2d[float],
-        entry_start: wp.array[int],
-        entry_certain: wp.array2d[int],
-        entry_end: wp.array2d[int],
-        entry_length: wp.array[wp.vec4],
-        entry_rank: wp.array[int],
+        entries_of: wp.array[wp.vec4i],
+        entry: wp.array[wp.vec2i],
+        entry_limit: wp.array[wp.vec2],
         held_start: wp.array[int],
         held_length: wp.array[wp.vec4],
         held_rank: wp.array[int],
@@ -203,15 +255,20 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         state_out: wp.array[float],
         diverged_out: wp.array[int],
     ):
-        """Advance each node for each group of candidates (`parts` warps a node and group)."""
-        thread = wp.tid()
-        lane = thread % 32
-        part = thread // 32 % wp.static(parts)
+        """Advance each node for some groups of candidates (`parts` warps a node and group).
+
+        A group has `places` for nodes, of which the last ones may be empty.
+        """
+        thread = number_of_thread()
+        lane = thread & 31
+        part = (thread >> 5) & wp.static(parts - 1)
         nodes = held_start.shape[0] - 1
-        task = thread // wp.static(32 * parts)
-        group = task // nodes
-        node = task - group * nodes
-        if group >= groups:
+        group = first_group
+        node = thread >> wp.static((32 * parts).bit_length() - 1)
+        while node >= places:  # A division takes longer, and a launch has few groups.
+            node -= places
+            group += 1
+        if node >= nodes:
             return
         own = 192 * (group * nodes + node) + lane
         numbers = wp.static(32 * len(CANDIDATE_FIELDS)) * group + lane
@@ -219,43 +276,32 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         v = vectors()
         force = vectors()
         for k in range(3):
-            x[k] = load(state, own + 32 * k)
-            v[k] = load(state, own + 96 + 32 * k)
-        material = materials()
-        for k in range(4):
-            material[k] = load(
-                number, numbers + 32 * (wp.static(CANDIDATE_FIELDS.index("stiffness")) + k)
-            )
+            x[k] = load(state, own, 32 * k)
+            v[k] = load(state, own, 96 + 32 * k)
+        entries = read_record(entries_of, group * nodes + node)
         force = sum_springs(
             state,
             192 * group * nodes + lane,
-            entry_length,
-            entry_rank,
-            entry_start[node],
-            entry_certain[group, node],
-            entry_end[group, node],
+            entry,
+            entry_limit,
+            entries[0],
+            entries[1],
+            entries[2],
             part,
+            number,
+            numbers,
             x,
             v,
-            material,
             force,
         )
-        dt = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("dt")))
-        velocity_loss = load(
-            number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("velocity_loss"))
-        )
-        gravity = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("gravity")))
-        has_ground = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("has_ground")))
-        ground_height = load(
-            number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("ground_height"))
-        )
-        restitution = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("restitution")))
-        friction = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("friction")))
-        control_rate = load(
-            number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("control_rate"))
-        )
-        speed_limit = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("speed_limit")))
-        for e in range(held_start[node] + part, held_start[node + 1], wp.static(parts)):
+        dt = load(number, numbers, wp.static(_row("dt")))
+        velocity_loss = load(number, numbers, wp.static(_row("velocity_loss")))
+        gravity = load(number, numbers, wp.static(_row("gravity")))
+        ground_height = load(number, numbers, wp.static(_row("ground_height")))
+        held = int(0)
+        if entries[3] > 0:
+            held = read_int(held_start, node)
+        for e in range(held + part, held + entries[3], wp.static(parts)):
             length = held_length[e]
             # The nearest control comes first, so no later one is in reach either.
             if length[0] >= reach[1, group]:
@@ -263,12 +309,10 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             control = wp.cast(length[3], wp.int32)
             rank = held_rank[e]
             at = control_position(control, fraction, control_start, control_end)
+            control_rate = load(number, numbers, wp.static(_row("control_rate")))
             tie = materials()
             for k in range(4):
-                tie[k] = load(
-                    number,
-                    numbers + 32 * (wp.static(CANDIDATE_FIELDS.index("virtual_stiffness")) + k),
-                )
+                tie[k] = load(number, numbers, wp.static(_row("virtual_stiffness")) + 32 * k)
             for i in range(wp.static(count)):
                 if length[0] < tie[2, i] and float(rank) < tie[3, i]:
                     speed = control_velocity(control, control_rate[i], control_start, control_end)
@@ -285,30 +329,36 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             force = add_parts(part, lane, force)
             if part > 0:
                 return
-        touching = clearance[node]
+        touching = read_float(clearance, node)
         for i in range(wp.static(count)):
             here = World()
             here.dt = dt[i]
             here.velocity_loss = velocity_loss[i]
             here.gravity = gravity[i]
-            here.has_ground = int(has_ground[i])
+            here.has_ground = 1
             here.ground_height = ground_height[i]
-            here.restitution = restitution[i]
-            here.friction = friction[i]
-            here.speed_limit = speed_limit[i]
             total = wp.vec3(force[0, i], force[1, i], force[2, i])
             free = free_velocity(here, wp.vec3(v[0, i], v[1, i], v[2, i]), total)
-            motion = advance(here, touching, wp.vec3(x[0, i], x[1, i], x[2, i]), free)
+            position = wp.vec3(x[0, i], x[1, i], x[2, i])
+            if touches_ground(here, touching, position, free):
+                here.restitution = load(number, numbers, wp.static(_row("restitution")))[i]
+                here.friction = load(number, numbers, wp.static(_row("friction")))[i]
+            motion = advance(here, touching, position, free)
             for k in range(3):
                 x[k, i] = motion.position[k]
                 v[k, i] = motion.velocity[k]
-            if is_too_fast(here, motion.velocity):
+            if is_too_fast(motion.velocity):
                 diverged_out[wp.static(count) * (32 * group + lane) + i] = 1
         for k in range(3):
-            store(state_out, own + 32 * k, x[k])
-            store(state_out, own + 96 + 32 * k, v[k])
+            store(state_out, own, 32 * k, x[k])
+            store(state_out, own, 96 + 32 * k, v[k])
 
     return advance_batch
+
+
+def _row(name: str) -> int:
+    """Return where the candidates' numbers of this name begin, 32 threads a row."""
+    return 32 * CANDIDATE_FIELDS.index(name)
 
 
 @wp.func

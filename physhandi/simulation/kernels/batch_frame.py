@@ -143,8 +143,8 @@ _KEPT_PAIR = """
 #endif
     return value;
 """
-# The arithmetic of `kernels.batch`, for half-edges that say where the other end lies in shared
-# memory, which candidates lack them, and one over the rest length.
+# What follows is `cuda_frame.pull` summed over a node's springs, for half-edges that say where the
+# other end lies in shared memory, which candidates lack them, and one over the rest length.
 _SUM_SPRINGS = """
     wp::mat_t<3, 2, wp::float32> force;
 #if defined(__CUDA_ARCH__)
@@ -458,21 +458,18 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
         dt = kept_numbers(wp.static(_row("dt")) + 2 * pair)
         loss = kept_numbers(wp.static(_row("velocity_loss")) + 2 * pair)
         gravity = kept_numbers(wp.static(_row("gravity")) + 2 * pair)
-        has_ground = kept_numbers(wp.static(_row("has_ground")) + 2 * pair)
         height = kept_numbers(wp.static(_row("ground_height")) + 2 * pair)
         restitution = kept_numbers(wp.static(_row("restitution")) + 2 * pair)
         friction = kept_numbers(wp.static(_row("friction")) + 2 * pair)
-        speed_limit = kept_numbers(wp.static(_row("speed_limit")) + 2 * pair)
         for c in range(2):
             world = World()
             world.dt = dt[c]
             world.velocity_loss = loss[c]
             world.gravity = gravity[c]
-            world.has_ground = int(has_ground[c])
+            world.has_ground = 1
             world.ground_height = height[c]
             world.restitution = restitution[c]
             world.friction = friction[c]
-            world.speed_limit = speed_limit[c]
             total = wp.vec3(force[0, c], force[1, c], force[2, c])
             x = wp.vec3(here[0, c], here[1, c], here[2, c])
             v = wp.vec3(here[3, c], here[4, c], here[5, c])
@@ -480,7 +477,7 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
             for k in range(3):
                 here[k, c] = motion.position[k]
                 here[3 + k, c] = motion.velocity[k]
-            if is_too_fast(world, motion.velocity):
+            if is_too_fast(motion.velocity):
                 diverged_out[candidate + c] = 1
         return here
 

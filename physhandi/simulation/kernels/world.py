@@ -22,4 +22,3 @@ class World:
     self_restitution: wp.float32
     self_friction: wp.float32
     collides_rest_neighbors: wp.int32
-    speed_limit: wp.float32

@@ -7,7 +7,9 @@ import pytest
 import warp as wp
 
 from physhandi.errors import UsageError
+from physhandi.simulation.engines import batch
 from physhandi.simulation.engines.batch import BatchSimulator, Population
+from physhandi.simulation.kernels.batch import BLOCK_NODES
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
@@ -103,15 +105,15 @@ def test_each_candidate_moves_as_if_it_were_alone(device, count, way):
     node, control, velocity = scene()
     drawn = candidates(count)
     master = master_of(node, control, drawn, velocity)
-    batch = simulator_of(way, master, drawn, device).rollout(control)
-    assert batch.position.shape == (count, 4, len(node), 3)
-    assert np.all(batch.diverged_frame == -1)
+    moved = simulator_of(way, master, drawn, device).rollout(control)
+    assert moved.position.shape == (count, 4, len(node), 3)
+    assert np.all(moved.diverged_frame == -1)
     for candidate in range(0, count, 1 if device == "cpu" and count < 4 else 7):
         wanted = alone(drawn[candidate], node, control, velocity, device)
         assert np.abs(wanted[-1] - wanted[0]).max() > 0.003
-        np.testing.assert_allclose(batch.position[candidate], wanted, atol=2e-6)
+        np.testing.assert_allclose(moved.position[candidate], wanted, atol=2e-6)
     if count > 1:
-        assert np.abs(batch.position[0] - batch.position[1]).max() > 1e-4
+        assert np.abs(moved.position[0] - moved.position[1]).max() > 1e-4
 
 
 @pytest.mark.gpu
@@ -122,10 +124,10 @@ def test_sizes_that_fit_shared_memory_in_different_ways(side, side_by_side):
     node, control, velocity = scene(side)
     drawn = [p.replace(connection_radius=0.03, max_neighbors=60) for p in candidates(3)]
     master = master_of(node, control, drawn, velocity)
-    batch = BatchSimulator(master, drawn, "cuda:0", side_by_side=side_by_side).rollout(control)
+    moved = BatchSimulator(master, drawn, "cuda:0", side_by_side=side_by_side).rollout(control)
     for candidate, parameters in enumerate(drawn):
         wanted = alone(parameters, node, control, velocity, "cuda:0")
-        np.testing.assert_allclose(batch.position[candidate], wanted, atol=5e-6)
+        np.testing.assert_allclose(moved.position[candidate], wanted, atol=5e-6)
 
 
 @pytest.mark.gpu
@@ -140,10 +142,10 @@ def test_a_node_with_more_neighbors_than_fit_is_simulated_too(side_by_side):
         for s in (0.05, 0.2)
     ]
     master = master_of(node, still, drawn, np.zeros_like(node))
-    batch = BatchSimulator(master, drawn, "cuda:0", side_by_side=side_by_side).rollout(still)
+    moved = BatchSimulator(master, drawn, "cuda:0", side_by_side=side_by_side).rollout(still)
     wanted = alone(drawn[1], node, still, np.zeros_like(node), "cuda:0")
     assert np.abs(wanted[-1] - wanted[0]).max() > 1e-3
-    np.testing.assert_allclose(batch.position[1], wanted, atol=5e-6)
+    np.testing.assert_allclose(moved.position[1], wanted, atol=5e-6)
 
 
 @pytest.mark.gpu
@@ -154,18 +156,18 @@ def test_candidates_of_a_large_object_share_blocks():
     drawn = [p.replace(ground_height=None) for p in candidates(62)]
     master = master_of(node, control, drawn, velocity)
     simulator = BatchSimulator(master, drawn, "cuda:0")
-    batch = simulator.rollout(control)
+    moved = simulator.rollout(control)
     assert isinstance(simulator._population, Population)
     blocks = simulator._population.blocks
     assert blocks is not None
     for candidate in range(0, 62, 9):
         wanted = alone(drawn[candidate], node, control, velocity, "cuda:0")
-        np.testing.assert_allclose(batch.position[candidate], wanted, atol=5e-6)
+        np.testing.assert_allclose(moved.position[candidate], wanted, atol=5e-6)
     # The same bits again, also once tags begin again.
     blocks._relay._tag = 2**31 - 2**20 - 100
     for _ in range(2):
         again = simulator.rollout(control)
-        assert np.array_equal(again.position, batch.position)
+        assert np.array_equal(again.position, moved.position)
     assert blocks._relay._tag < 10_000
 
 
@@ -176,12 +178,45 @@ def test_a_thousand_candidates_at_once():
     drawn = candidates(1000)
     master = master_of(node, control, drawn, velocity)
     simulator = BatchSimulator(master, drawn, device="cuda:0")
-    batch = simulator.rollout(control)
+    moved = simulator.rollout(control)
     for candidate in (0, 499, 999):
         wanted = alone(drawn[candidate], node, control, velocity, "cuda:0")
-        np.testing.assert_allclose(batch.position[candidate], wanted, atol=2e-6)
+        np.testing.assert_allclose(moved.position[candidate], wanted, atol=2e-6)
     again = simulator.rollout(control)
-    assert np.array_equal(again.position, batch.position)
+    assert np.array_equal(again.position, moved.position)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("substeps", [120, 121])
+def test_parts_of_a_large_batch_move_one_after_the_other_to_the_same_bits(monkeypatch, substeps):
+    _needs_cuda()
+    node, control, velocity = scene(6)
+    drawn = [
+        p.replace(substeps_per_frame=substeps, ground_height=None if index % 2 else 0.0)
+        for index, p in enumerate(candidates(1000))
+    ]
+    master = master_of(node, control, drawn, velocity)
+    found = {}
+    for cached in (0.0, 1e9):
+        monkeypatch.setattr(batch, "_CACHED_BYTES", cached)
+        simulator = BatchSimulator(master, drawn, device="cuda:0", side_by_side=False)
+        found[cached] = simulator.rollout(control).position
+        parts = len(simulator._population._frame_graphs)
+        assert parts == (16 if cached == 0.0 else 1)
+    assert np.array_equal(found[0.0], found[1e9])
+    for candidate in (0, 501, 998, 999):
+        wanted = alone(drawn[candidate], node, control, velocity, "cuda:0")
+        np.testing.assert_allclose(found[0.0][candidate], wanted, atol=2e-6)
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 1000])
+def test_nodes_of_a_block_of_threads_lie_together(count):
+    node = np.random.default_rng(0).permutation(scene(10)[0])[:count]
+    order = batch._in_blocks(node)
+    assert sorted(order) == list(range(count))
+    if count == 1000:
+        for block in np.split(order, range(BLOCK_NODES, count, BLOCK_NODES)):
+            assert np.ptp(node[block], axis=0).max() < 0.05 < np.ptp(node, axis=0).min()
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -192,12 +227,12 @@ def test_a_candidate_that_diverges_does_not_harm_the_others(device, way):
     drawn = candidates(5)
     drawn[2] = drawn[2].replace(stiffness=1e7, connection_radius=0.02, max_neighbors=19)
     master = master_of(node, control, drawn, velocity)
-    batch = simulator_of(way, master, drawn, device).rollout(control)
-    assert batch.diverged_frame[2] >= 1
-    assert np.all(np.delete(batch.diverged_frame, 2) == -1)
+    moved = simulator_of(way, master, drawn, device).rollout(control)
+    assert moved.diverged_frame[2] >= 1
+    assert np.all(np.delete(moved.diverged_frame, 2) == -1)
     for candidate in (0, 4):
         wanted = alone(drawn[candidate], node, control, velocity, device)
-        np.testing.assert_allclose(batch.position[candidate], wanted, atol=2e-6)
+        np.testing.assert_allclose(moved.position[candidate], wanted, atol=2e-6)
 
 
 def test_what_must_be_common_and_what_a_batch_cannot_do_are_refused():
