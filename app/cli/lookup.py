@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from app.jobs.catalog import Catalog
+from app.jobs.catalog import Catalog, UnknownRunError, UnknownSequenceError
 from app.settings import ServerSettings
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
@@ -52,13 +52,14 @@ def folder_of_sequence(name: str, data_dir: Path | None) -> Path:
     if (Path(name) / "sequence.yaml").is_file():
         return Path(name)
     catalog = open_catalog(data_dir)
-    names = [entry.id for entry in catalog.sequences()]
-    if name not in names:
+    try:
+        return catalog.sequence_item(name).folder
+    except UnknownSequenceError:  # Only now all are opened, of which there may be many.
+        names = [entry.id for entry in catalog.sequences()]
         raise UsageError(
             f"'{name}' is neither a folder with a sequence.yaml nor a known sequence. "
             f"Known are: {', '.join(names) or 'none'}."
-        )
-    return catalog.sequence_item(name).folder
+        ) from None
 
 
 def find_sequence(name: str, data_dir: Path | None) -> Sequence:
@@ -80,13 +81,14 @@ def find_run(name: str, data_dir: Path | None) -> Run:
     if (Path(name) / "run.yaml").is_file():
         return Run.open(Path(name))
     catalog = open_catalog(data_dir)
-    ids = [entry.id for entry in catalog.runs()]
-    if name not in ids:
+    try:
+        return catalog.run(name)
+    except UnknownRunError:  # As above.
+        ids = [entry.id for entry in catalog.runs()]
         raise RunError(
             f"'{name}' is neither a run folder nor a known run. "
             f"Known are: {', '.join(ids) or 'none'}."
-        )
-    return catalog.run(name)
+        ) from None
 
 
 def find_result(name: str, data_dir: Path | None) -> Run:

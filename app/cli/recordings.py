@@ -39,9 +39,10 @@ def check(
     for name in sequences:
         found = RecordingCheck(stages={}, problems=())
         try:
+            folder = folder_of_sequence(name, data_dir)
             with watched(True) as progress:
-                found = check_recording(folder_of_sequence(name, data_dir), progress)
-            sequence = find_sequence(name, data_dir)
+                found = check_recording(folder, progress)
+            sequence = Sequence.load(folder)
         except PhysHandiError as error:
             reports[name] = {"error": str(error), **_told(found, as_json=as_json)}
             continue

@@ -18,6 +18,7 @@ from app.cli import runs
 from app.settings import BUNDLED
 from physhandi import pipeline
 from physhandi.data.run import RunFolder
+from physhandi.data.sequence import Sequence
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
@@ -435,6 +436,23 @@ def test_sequences_are_checked_file_by_file(terminal: Terminal) -> None:
     assert terminal("check", "sheet", "towel_fold") == 1
     assert "marker.npy" in terminal.out
     assert "at least one sequence" in terminal.refused(2, "check")
+
+
+def test_a_sequence_is_found_by_name_without_opening_all_others(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    load = Sequence.load
+
+    def noted(folder: Path) -> Sequence:
+        opened.append(Path(folder).name)
+        return load(folder)
+
+    monkeypatch.setattr(Sequence, "load", noted)
+    assert terminal("check", "sheet") == 0
+    assert set(opened) == {"sheet"}
+    assert "Known are: sheet, " in terminal.refused(2, "reconstruct", "nowhere")
+    assert len(set(opened)) > 1
 
 
 def test_the_page_of_the_command_line_tells_what_the_commands_take() -> None:
