@@ -157,18 +157,18 @@ def number_of_thread() -> int:
 
 
 @wp.func_native(snippet=_READ)
-def read_int(data: wp.array[int], index: int) -> int:
+def int_at(data: wp.array[int], index: int) -> int:
     """Read a number of a contiguous array."""
 
 
 @wp.func_native(snippet=_READ)
-def read_float(data: wp.array[float], index: int) -> float:
+def float_at(data: wp.array[float], index: int) -> float:
     """Read a number of a contiguous array."""
 
 
 @wp.func_native(snippet=_READ_FOUR)
-def read_record(data: wp.array[wp.vec4i], index: int) -> wp.vec4i:
-    """Read a record of four numbers of a contiguous array."""
+def four_at(data: wp.array[wp.vec4i], index: int) -> wp.vec4i:
+    """Read four numbers of a contiguous array."""
 
 
 def block_threads(parts: int) -> int:
@@ -278,7 +278,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         for k in range(3):
             x[k] = load(state, own, 32 * k)
             v[k] = load(state, own, 96 + 32 * k)
-        entries = read_record(entries_of, group * nodes + node)
+        entries = four_at(entries_of, group * nodes + node)
         force = sum_springs(
             state,
             192 * group * nodes + lane,
@@ -300,7 +300,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         ground_height = load(number, numbers, wp.static(_row("ground_height")))
         held = int(0)
         if entries[3] > 0:
-            held = read_int(held_start, node)
+            held = int_at(held_start, node)
         for e in range(held + part, held + entries[3], wp.static(parts)):
             length = held_length[e]
             # The nearest control comes first, so no later one is in reach either.
@@ -329,7 +329,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             force = add_parts(part, lane, force)
             if part > 0:
                 return
-        touching = read_float(clearance, node)
+        touching = float_at(clearance, node)
         for i in range(wp.static(count)):
             here = World()
             here.dt = dt[i]
