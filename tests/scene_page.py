@@ -36,8 +36,9 @@ if (location.pathname.includes("/viewer/"))
   Object.defineProperty(window, "devicePixelRatio", { get: () => 0.5 });
 """
 """Scenes are drawn with a quarter of their pixels and stretched; files of pictures keep theirs."""
-LESS_DRAWING = ("--disable-gpu-compositing", "--webgl-msaa-sample-count=0")
-"""Flags of Chromium: without a graphics card draw each picture once, and smooth none."""
+LESS_WORK = ("--disable-gpu-compositing", "--webgl-msaa-sample-count=0", "--js-flags=--no-opt")
+"""Flags of Chromium: without a graphics card draw each picture once, and smooth none. And optimise
+no scripts, for which no page of a test lives long enough."""
 _SENT = "() => new Promise((done) => setTimeout(done, 60))"
 """viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
 _PICTURE = "() => new Promise((done) => requestAnimationFrame(done))"

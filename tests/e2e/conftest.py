@@ -25,7 +25,7 @@ from playwright.sync_api import (
 from scene_page import (
     COARSER_PICTURES,
     FEWER_PICTURES,
-    LESS_DRAWING,
+    LESS_WORK,
     TIMEOUT_MS,
     ScenePage,
 )
@@ -173,7 +173,7 @@ def browser(playwright_driver: Playwright) -> Iterator[Browser]:
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     browser = playwright_driver.chromium.launch(
         executable_path=executable,
-        args=_CHROMIUM + ([] if os.environ.get(_PICTURES) else [*LESS_DRAWING]),
+        args=_CHROMIUM + ([] if os.environ.get(_PICTURES) else [*LESS_WORK]),
         timeout=TIMEOUT_MS,
     )
     yield browser

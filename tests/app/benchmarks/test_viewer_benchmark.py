@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_DRAWING
+from scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_WORK
 
 from app import cli
 from app.benchmarks import browser, latency, streams, viewer
@@ -39,7 +39,7 @@ def little(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(browser, "_COUNTED_MS", 500.0)
     # Without a graphics card every picture and every pixel costs, and windows cost more.
     monkeypatch.setattr(browser, "BROWSERS", browser.BROWSERS[::-1])
-    monkeypatch.setattr(browser, "_FLAGS", browser._FLAGS + LESS_DRAWING)
+    monkeypatch.setattr(browser, "_FLAGS", browser._FLAGS + LESS_WORK)
     drawn = COARSER_PICTURES + FEWER_PICTURES
     monkeypatch.setattr(browser, "_WATCH", drawn + browser._WATCH)
     monkeypatch.setattr(browser, "_SIZE", (900, 500))
