@@ -1,14 +1,15 @@
 """A hand's motion: one shape, and the pose of every frame."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
+from torch import Tensor
 
-from physhandi.hand.model import HandModel, HandPose
+from physhandi.hand.model import HandModel
 from physhandi.hand.names import HandKind, HandSide
 
 _BATCH = 128
@@ -42,13 +43,14 @@ class HandMotion:
 
     def vertices(self, model: HandModel) -> Float[ndarray, "frame vertex 3"]:
         """Compute the surface in every frame [length unit of the sequence], in float32."""
-        return np.concatenate([pose.vertex.numpy() for pose in self._poses(model)])
+        return self._posed(model, lambda *pose: model(*pose).vertex)
 
     def keypoints(self, model: HandModel) -> Float[ndarray, "frame 21 3"]:
         """Compute the keypoints in every frame [length unit of the sequence], in float32."""
-        return np.concatenate([pose.keypoint.numpy() for pose in self._poses(model)])
+        return self._posed(model, model.keypoints)
 
-    def _poses(self, model: HandModel) -> list[HandPose]:
+    def _posed(self, model: HandModel, points: Callable[..., Tensor]) -> ndarray:
+        """Compute points of all frames, some frames at a time."""
         if model.side != self.side:
             raise ValueError(
                 f"the motion of a {self.side} hand was given a {model.side} hand model"
@@ -60,17 +62,18 @@ class HandMotion:
         arrays = (self.articulation, self.wrist_rotation, self.wrist_translation)
         shape = torch.from_numpy(self.shape.astype(np.float32))
         with torch.no_grad():
-            return [
-                model(
+            batches = [
+                points(
                     shape,
                     *(
                         torch.from_numpy(a[start : start + _BATCH].astype(np.float32))
                         for a in arrays
                     ),
-                    scale=self.scale,
+                    self.scale,
                 )
                 for start in range(0, self.frame_count, _BATCH)
             ]
+        return np.concatenate([batch.numpy() for batch in batches])
 
     def to_tensors(self) -> dict[str, ndarray]:
         """Describe the motion as arrays, as a run's ``hand_<side>.safetensors`` holds it."""
