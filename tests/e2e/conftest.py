@@ -2,7 +2,6 @@
 
 import io
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -148,14 +147,16 @@ def _shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]
 
 
 @pytest.fixture(scope="module")
-def served(_shared_server: Served) -> Iterator[Served]:
+def served(_shared_server: Served, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """The server of all files, each of which leaves to the next what it found there."""
     places = [_shared_server.data_dir / name for name in _PLACES]
     found = {path for place in places for path in place.glob("*")}
     yield _shared_server
+    aside = tmp_path_factory.mktemp("aside")
     for path in {path for place in places for path in place.glob("*")} - found:
         end_processes(path, grace_s=0)
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        # At once: the server, which is still at work, may be writing there.
+        path.rename(aside / f"{path.parent.name}.{path.name}")
 
 
 @pytest.fixture(scope="package")

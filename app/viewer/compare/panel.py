@@ -63,8 +63,8 @@ class ComparePanel:
         self._names = dict.fromkeys(SIDE_KEYS, "")
         self._notes: tuple[str, ...] = ()
         self._length_unit, self._unit, self._factor = "m", "mm", 1e3
-        self._tick = 0
-        self._plotted = 0
+        self._tick: int | None = None  # None until the clock tells it.
+        self._plotted: int | None = None
         # What is written must not be older than what it replaces.
         self._lock = threading.RLock()
         gui = server.gui
@@ -195,7 +195,8 @@ class ComparePanel:
 
     def _lines(self) -> list[str]:
         """Say how far A and B are apart, how that is measured, and what the pair's notes are."""
-        difference, way = self._curve.at(self._tick), self._curve.way
+        way = self._curve.way
+        difference = None if self._tick is None else self._curve.at(self._tick)
         lines: list[str] = []
         if difference is not None:
             mean, largest = (
@@ -218,7 +219,8 @@ class ComparePanel:
     def _draw_plot(self) -> None:
         self._plotted = self._tick
         self._plot.offer(on=self._curve.way is not None)
-        self._plot.show([curve * self._factor for curve in self._curve.columns()], self._tick)
+        if self._tick is not None:
+            self._plot.show([curve * self._factor for curve in self._curve.columns()], self._tick)
 
 
 def _mark(color: str) -> str:

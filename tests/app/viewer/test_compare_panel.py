@@ -84,6 +84,20 @@ def test_what_was_measured_is_not_overwritten_by_what_was_known_before(
     assert "measuring" not in said
 
 
+def test_no_difference_is_told_before_the_clock_has_told_its_tick(
+    server: viser.ViserServer,
+) -> None:
+    curve = MeasuredMeanwhile()
+    curve.is_measured = True
+    panel = ComparePanel(server, Guard(server), Look(), curve, change=lambda: None)
+    panel.name({"a": "one", "b": "two"}, (), unit="m", tick_count=12)
+    panel.follow()
+    assert "measuring" in panel._text.content
+    assert "mean" not in panel._text.content
+    panel.show(3, is_playing=False)
+    assert "mean 40" in panel._text.content
+
+
 def test_a_panel_tells_whether_its_color_scale_changed(server: viser.ViserServer) -> None:
     look = Look(tint="difference")
     curve = MeasuredMeanwhile()
