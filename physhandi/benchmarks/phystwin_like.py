@@ -12,6 +12,7 @@ import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.kernels.baseline import (
     add_spring_forces,
     integrate,
@@ -58,13 +59,11 @@ class PhysTwinLike:
         self._scratch = wp.zeros_like(self.velocity), wp.zeros_like(self.velocity), control
         # A captured graph does not keep its arrays alive.
         self._kept: list[Any] = []
-        self._forward: wp.Graph | None = None
-        self._both: wp.Graph | None = None
+        self._forward = LaunchGraph(self._launch_forward, wp.get_device(device))
+        self._both: LaunchGraph | None = None
 
     def rollout(self, control: Float[ndarray, "frame control 3"]) -> None:
         """Simulate all frames from the initial state; `position` is where they end."""
-        if self._forward is None:
-            self._forward = self._capture(self._launch_forward)
         self._replay(self._forward, control)
 
     def rollout_with_gradient(self, control: Float[ndarray, "frame control 3"]) -> None:
@@ -74,20 +73,20 @@ class PhysTwinLike:
         frame's start is taken as given.
         """
         if self._both is None:
-            self._both = self._capture(self._launch_both())
+            self._both = LaunchGraph(self._launch_both(), wp.get_device(self.device))
         learned: tuple[Any, ...] = (self.log_stiffness, self.restitution, self.friction)
         for value in learned:
             value.grad.zero_()
         self._replay(self._both, control)
 
-    def _replay(self, graph: wp.Graph, control: Float[ndarray, "frame control 3"]) -> None:
+    def _replay(self, graph: LaunchGraph, control: Float[ndarray, "frame control 3"]) -> None:
         self.position.assign(self.model.object_node)
         self.velocity.assign(self.model.initial_velocity)
         for frame in range(1, len(control)):
             if self.model.control_count:
                 self.controls[0].assign(control[frame - 1])
                 self.controls[1].assign(control[frame])
-            wp.capture_launch(graph)
+            graph.replay()
 
     def _launch_forward(self) -> None:
         state = self.position, self.velocity
@@ -130,14 +129,6 @@ class PhysTwinLike:
             wp.copy(self.velocity, rows[-1][1])
 
         return launch
-
-    def _capture(self, launch: Any) -> wp.Graph:
-        is_cuda = wp.get_device(self.device).is_cuda
-        with wp.ScopedCapture(device=self.device, force_module_load=is_cuda) as capture:
-            launch()
-        if capture.graph is None:
-            raise RuntimeError(f"Warp captured no graph on {self.device}.")
-        return capture.graph
 
     def _substep(self, substep: int, before: Any, scratch: Any, after: Any) -> None:
         force, velocity, control = scratch

@@ -82,6 +82,29 @@ def finite_differences(scene, weights, places, step=1e-6):
     return (loss[0] - loss[1]) / (2.0 * step)
 
 
+def assert_gradients(scene, found, weights, *, picks, least, tolerance):
+    """Compare some numbers of every gradient with differences; relative to the largest of each.
+
+    Args:
+        scene: What was simulated.
+        found: The gradients of its arguments.
+        weights: Of the loss.
+        picks: Numbers of each gradient.
+        least: What a gradient is taken to be at least.
+        tolerance: Largest difference, as a part of that.
+    """
+    rng = np.random.default_rng(1)
+    places = [
+        (name, np.unravel_index(pick, gradient.shape))
+        for name, gradient in found.items()
+        for pick in rng.permutation(gradient.size)[:picks]
+    ]
+    expected = finite_differences(scene, weights, places)
+    for (name, index), difference in zip(places, expected, strict=True):
+        atol = tolerance * max(np.abs(found[name]).max(), least)
+        np.testing.assert_allclose(found[name][index], difference, atol=atol, err_msg=name)
+
+
 def directional_difference(scene, weights, name, direction, step=1e-6):
     """Differentiate along a direction; refuse to step over a change of the colliding pairs."""
     values, counts = arguments(scene), []

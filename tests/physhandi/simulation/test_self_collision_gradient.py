@@ -5,8 +5,8 @@ import pytest
 import torch
 from reference.gradients import (
     arguments,
+    assert_gradients,
     directional_difference,
-    finite_differences,
     gradients,
     loss_weights,
     oracle_loss,
@@ -31,16 +31,7 @@ def test_gradients_agree_with_central_differences_of_the_oracle(device, changes,
     oracle_loss(scene, weights, arguments(scene), counts)
     assert sum(counts) == count
     found = gradients(scene, device, weights)
-    rng = np.random.default_rng(1)
-    places = [
-        (name, np.unravel_index(pick, gradient.shape))
-        for name, gradient in found.items()
-        for pick in rng.permutation(gradient.size)[:3]
-    ]
-    expected = finite_differences(scene, weights, places)
-    for (name, index), difference in zip(places, expected, strict=True):
-        scale = max(np.abs(found[name]).max(), 1e-3)
-        np.testing.assert_allclose(found[name][index], difference, atol=1e-4 * scale, err_msg=name)
+    assert_gradients(scene, found, weights, picks=3, least=1e-3, tolerance=1e-4)
     for name in ("self_restitution", "self_friction"):
         assert abs(found[name]) > 1e-3, name
 
