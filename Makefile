@@ -14,12 +14,20 @@ PIP_FLAGS := --quiet --disable-pip-version-check --no-compile -c constraints.txt
 install: $(STAMP)
 
 # A newer pip than a fresh environment has needs half the time. It leaves compiling to the first
-# import: of all modules that are installed few are used.
+# import: of all modules that are installed few are used. One pip keeps one processor busy, so two
+# install what the second part of constraints.txt names, each its own packages; the last looks for
+# what these have left out.
 export PYTHONDONTWRITEBYTECODE :=
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_FLAGS) --upgrade pip
-	$(BIN)/python -m pip install $(PIP_FLAGS) $(TORCH)
+	sed '1,/^# What else/d; /^# Other/,$$d' constraints.txt >$(VENV)/packages
+	awk 'NR % 3 == 0' $(VENV)/packages >$(VENV)/packages.first
+	awk 'NR % 3 != 0' $(VENV)/packages >$(VENV)/packages.second
+	{ $(BIN)/python -m pip install $(PIP_FLAGS) $(TORCH) && \
+	  $(BIN)/python -m pip install $(PIP_FLAGS) --no-deps -r $(VENV)/packages.first; } & first=$$!; \
+	$(BIN)/python -m pip install $(PIP_FLAGS) --no-deps -r $(VENV)/packages.second; second=$$?; \
+	wait $$first && exit $$second
 	$(BIN)/python -m pip install $(PIP_FLAGS) -e ".[dev,synth,capture,models,newton,usd]"
 	touch $@
 

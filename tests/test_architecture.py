@@ -7,6 +7,7 @@ import subprocess
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,6 +15,8 @@ import beartype
 import jaxtyping
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 Node = TypeVar("Node", bound=ast.AST)
 ROOT = Path(__file__).parent.parent
@@ -263,3 +266,33 @@ def test_shapes_are_checked_in_the_first_calls_of_a_function() -> None:
     for _ in range(1_000):
         assert first(wrong[:, :3]) == 1.0
     assert first(wrong) == 1.0  # Checking all calls of a fit takes longer than the fit.
+
+
+def _needed(requirement: Requirement, found: dict[str, set[str]]) -> None:
+    """Add an installed package and all that it needs, with the extras that are asked of each."""
+    name = canonicalize_name(requirement.name)
+    if name in found and requirement.extras <= found[name]:
+        return
+    found.setdefault(name, set()).update(requirement.extras)
+    for need in map(Requirement, distribution(name).requires or ()):
+        marker = need.marker
+        if marker is None or any(marker.evaluate({"extra": e}) for e in ("", *found[name])):
+            _needed(need, found)
+
+
+def test_constraints_name_what_is_installed_beside_torch() -> None:
+    """`make install` gives these lines to two processes; what is missing there would come late."""
+    extras = re.search(r'-e "\.(\[.+?\])"', (ROOT / "Makefile").read_text())
+    assert extras is not None
+    ours: dict[str, set[str]] = {}
+    torch: dict[str, set[str]] = {}
+    try:
+        _needed(Requirement(f"physhandi{extras[1]}"), ours)
+        _needed(Requirement("torch"), torch)
+    except PackageNotFoundError as error:
+        pytest.skip(f"needs all that `make install` installs: {error}")
+    assert len(ours) > 100
+    text = (ROOT / "constraints.txt").read_text()
+    part = text.partition("# What else")[2].partition("# Other")[0].splitlines()[1:]
+    named = {canonicalize_name(Requirement(line).name) for line in part}
+    assert named == ours.keys() - torch.keys() - {"physhandi"}
