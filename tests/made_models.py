@@ -100,6 +100,8 @@ def cotracker3_offline(*, pretrained=True, **kwargs):
 """
 )
 
+BREAKS_OFF = "breaks_off"
+"""A file in whose presence, in its folder, a TAPNext ends its process at once."""
 _TAPNEXT = (
     _MATCHING
     + """
@@ -111,6 +113,8 @@ class TAPNext(torch.nn.Module):
         self.matcher = Matcher(8, 8)
 
     def forward(self, video, query_points=None, state=None):
+        if (Path(__file__).parents[2] / "breaks_off").exists():
+            os.abort()
         assert video.shape == (1, 1, *self.image_size, 3)
         assert -1 <= video.min() < -0.1 and video.max() <= 1
         image = 127.5 * (video[0, 0].mean(-1) + 1)

@@ -63,17 +63,15 @@ def with_error(
         error: Mean joint error to be reached [m].
         seed: Of the noise.
         width: Standard deviation of the Gaussian that smooths the noise in time (its variance is
-            restored) [frames]; 0 draws every frame by itself.
+            restored) [frames].
         frames: Frames that the mean is taken over.
     """
     random = np.random.default_rng(seed)
 
     def draw(*shape: int) -> np.ndarray:
         noise = random.standard_normal((motion.frame_count, *shape))
-        if width:
-            noise = gaussian_filter1d(noise, width, axis=0, mode="reflect")
-            noise /= noise.std()
-        return noise
+        noise = gaussian_filter1d(noise, width, axis=0, mode="reflect")
+        return noise / noise.std()
 
     place, turn, pose = 0.01 * draw(3), 0.1 * draw(3), 0.1 * draw(15, 3)
 

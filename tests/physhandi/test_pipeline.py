@@ -150,27 +150,6 @@ def test_both_sequences_share_one_object(fitted: Run) -> None:
     assert np.ptp(np.log(low.stiffness[:count])) > 0.05
 
 
-def test_a_cancelled_run_goes_on_after_its_last_finished_stage(
-    tmp_path: Path, recordings: Path
-) -> None:
-    class Stopper(Progress):
-        def report(self, stage: str, iteration: int, *rest: Any, **more: Any) -> None:
-            if stage == pipeline.SPRINGS and iteration == 2:
-                run.request_cancel()
-
-    run = new_run(tmp_path / "stopped", [recordings / "low"], brief_config().to_dict())
-    with pytest.raises(CancelledError):
-        pipeline.run_job(run, Stopper())
-    assert Run.open(run.folder).state == "cancelled"
-    run.clear_cancel()
-    before = len(read_events(run.folder)[0])
-    pipeline.run_job(run)
-    again = {event["stage"] for event in read_events(run.folder)[0][before:]}
-    assert pipeline.SPRINGS in again
-    assert pipeline.SEARCH not in again
-    assert Run.open(run.folder).state == "succeeded"
-
-
 def simulate(folder: Path, source: Run, sequence: Path, **changes: float) -> Run:
     run = Run.create(
         folder,
@@ -322,13 +301,27 @@ def test_a_stopped_run_ends_with_the_bits_of_an_undisturbed_one(
     config = brief_config().to_dict()
     runs = [new_run(tmp_path / name, [recordings / "low"], config) for name in ("one", "two")]
     pipeline.run_job(runs[0])
-    for stage, at in ((pipeline.SEARCH, 3), (pipeline.SEARCH, 2), (pipeline.SPRINGS, 5)):
+    for stage, at in ((pipeline.SEARCH, 3), (pipeline.SEARCH, 2)):
         with pytest.raises(CancelledError):
             pipeline.run_job(runs[1], Stopper(at, stage=stage))
-    last = Stopper(stage=pipeline.SPRINGS)
+
+    class Asks(Progress):
+        def report(self, stage: str, iteration: int, *rest: Any, **more: Any) -> None:
+            if (stage, iteration) == (pipeline.SPRINGS, 5):
+                runs[1].request_cancel()
+
+    with pytest.raises(CancelledError):
+        pipeline.run_job(runs[1], Asks())
+    assert Run.open(runs[1].folder).state == "cancelled"
+    runs[1].clear_cancel()
+    last = Stopper()
     pipeline.run_job(runs[1], last)
-    assert [report[1] for report in last.reports] == [5, 6, 7, 8]
-    assert last.reports[0][3] == "Resumed after iteration 5."
+    # Stages that had ended are not repeated.
+    assert pipeline.SEARCH not in {report[0] for report in last.reports}
+    fitted = [report for report in last.reports if report[0] == pipeline.SPRINGS]
+    assert [report[1] for report in fitted] == [5, 6, 7, 8]
+    assert fitted[0][3] == "Resumed after iteration 5."
+    assert Run.open(runs[1].folder).state == "succeeded"
     for run in runs:
         Run.open(run.folder).verify()
     outs = [run.out for run in runs]

@@ -61,7 +61,7 @@ def test_chosen_vertices_are_those_of_the_whole_surface(hand: OpenHand) -> None:
     whole = hand(shape, articulation, still, still).vertex
     expected = torch.stack([surface[chosen] for surface, chosen in zip(whole, index, strict=True)])
     found = hand.chosen_vertices(index, shape, articulation)
-    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
+    np.testing.assert_allclose(found, expected, atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from clicked_disc import FRAMES, TOP, cameras, center, disc_click, write_disc
-from made_models import write_cotracker, write_tapnext
+from made_models import BREAKS_OFF, write_cotracker, write_tapnext
 
 from physhandi.errors import RunError, UsageError
 from physhandi.perception.annotation import annotate
@@ -58,7 +58,7 @@ def test_a_tracker_of_the_user_makes_tracks_like_built_in_ones(tmp_path):
     assert {path for path in folder.rglob("*") if path.is_file()} == {*before, ran}
 
 
-def test_points_of_a_middle_frame_are_followed_both_ways(tmp_path):
+def test_points_of_a_middle_frame_are_followed_both_ways_until_the_tracker_breaks_off(tmp_path):
     sequence, _ = write_disc(tmp_path / "disc")
     view = sequence.views[0]
     start = np.array(disc_click()[2:]) + np.array([[9, 0], [12, 3], [14, -4]])
@@ -67,6 +67,10 @@ def test_points_of_a_middle_frame_are_followed_both_ways(tmp_path):
         pixel, visible = model.follow(view, 4, start, Progress())
         assert model.provenance()["source"] == "tapnext"
         again, _ = model.follow(view, 0, start, Progress())
+        (folder / BREAKS_OFF).touch()
+        ended = r"tracker: .*process ended while it followed view 'top' from frame 3"
+        with pytest.raises(RunError, match=ended):
+            model.follow(view, 3, start, Progress())
     assert np.array_equal(pixel[4], start)
     assert visible.all()
     expected = true_motion("top", start, 4)
@@ -113,18 +117,6 @@ class Deed:
 
     def __reduce__(self):
         return (Path.touch, (self.mark,))
-
-
-def test_a_tracker_that_breaks_off_is_named_with_view_and_frame(tmp_path):
-    sequence, _ = write_disc(tmp_path / "disc", frames=2)
-    folder = write_cotracker(tmp_path / "maker", "import os; os.abort()")
-    with (
-        TrackModel(folder, sequence, is_trusted=True) as model,
-        pytest.raises(
-            RunError, match=r"maker: .*process ended while it followed view 'top' from fr"
-        ),
-    ):
-        model.follow(sequence.views[0], 0, np.array([[40.0, 40.0]]), Progress())
 
 
 def test_weights_execute_nothing_and_nothing_is_downloaded(tmp_path):

@@ -16,6 +16,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.progress import Progress
 from physhandi.run import Run
+from physhandi.synthetic.suite import evaluation
 from physhandi.synthetic.suite.cells import Bench
 from physhandi.synthetic.suite.evaluation import evaluate_suite, list_tasks
 from physhandi.synthetic.suite.folder import contact_kind
@@ -247,19 +248,27 @@ def test_fits_with_several_seeds_of_the_search_are_told_as_a_mean(
 
 
 def test_starts_and_disturbances_have_splits_of_their_own(
-    tmp_path: Path, recordings: tuple[Sequence, ...]
+    tmp_path: Path, recordings: tuple[Sequence, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     order = order_of(recordings, methods=("quick",), protocols=("sensitivity", "robustness"))
+    tasks = list(list_tasks(order, (parse_method("quick"),)))
+    # Seven starts of the first sequence, and three disturbances of both.
+    starts = [task for task in tasks if task.protocol == "sensitivity"]
+    assert [task.recording.name for task in starts] == ["low"] * 7
+    assert len({task.split for task in starts}) == 7
+    assert {"start δ=2 mm d_max=50", "start δ=40 mm d_max=3"} < {task.split for task in starts}
+    assert len(tasks) == 7 + 2 * 3
+    monkeypatch.setattr(evaluation, "SENSITIVITY", ((0.002, 50), (0.04, 3)))
     found = evaluate_suite(order, tmp_path)
-    # Seven starts of the first sequence; depth noise of both; no view to tell pixels, no hand.
-    assert (found["cells"], len(found["skipped"])) == (7 + 2, 4)
+    # Two starts; depth noise of both; no view to tell pixels, no hand.
+    assert (found["cells"], len(found["skipped"])) == (2 + 2, 4)
     splits = {split for _, split, _ in table(tmp_path)}
     assert "start δ=2 mm d_max=50/reconstruction" in splits
     assert "noisy_depth/future" in splits
     cells = json.loads((tmp_path / "cells.json").read_text())["cells"]
-    starts = [cell for cell in cells if cell["protocol"] == "sensitivity"]
-    assert {(cell["case"], cell["method"]) for cell in starts} == {("low", "quick")}
-    assert len({cell["run"] for cell in starts}) == 7
+    cells = [cell for cell in cells if cell["protocol"] == "sensitivity"]
+    assert {(cell["case"], cell["method"]) for cell in cells} == {("low", "quick")}
+    assert len({cell["run"] for cell in cells}) == 2
 
 
 @pytest.mark.parametrize(("action", "kind"), [("squeeze", "dense"), ("lift", "point")])

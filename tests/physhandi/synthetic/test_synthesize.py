@@ -1,6 +1,7 @@
 """The generator from end to end, and what it refuses."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,27 +49,32 @@ def test_what_is_seen_is_near_what_happened(rope):
     assert 30 < len(node) < 400
 
 
-def test_the_same_call_makes_the_same_sequence(rope, tmp_path):
-    again = synthesize(
-        "rope",
-        "push",
-        out=tmp_path / "rope",
+def test_actions_share_a_seed_s_body_but_not_its_cameras(rope, tmp_path):
+    changes = {"depth_noise": 0.05, "track_noise": 0.5}
+    lift = synthesize(
+        *("rope", "lift"),
+        out=tmp_path / "lift",
         seed=4,
-        frames=8,
+        frames=2,
+        cameras=1,
+        preset="clean",
+        changes=changes,
         images="none",
+        image_size="quarter",
+        held_out_view=True,
         resolution="tiny",
     )
-    assert again.fingerprint() == rope.fingerprint()
-
-
-def test_actions_share_a_seed_s_body_but_not_its_cameras(rope, tmp_path):
-    out = tmp_path / "lift"
-    lift = synthesize("rope", "lift", out=out, seed=4, frames=2, images="none", resolution="tiny")
     assert lift.description.split("rope of")[1] == rope.description.split("rope of")[1]
     turn = (
         lift.views[0].camera.T_world_camera[:3, :3].T @ rope.views[0].camera.T_world_camera[:3, :3]
     )
     assert np.trace(turn) < 2.99  # 6 degrees
+    # What was chosen for it.
+    assert lift.provenance["synthesize"]["preset"] == "clean"
+    assert lift.provenance["synthesize"]["changes"] == changes
+    assert lift.provenance["degradations"]["depth_noise"] == 0.05
+    assert [view.camera.width for view in lift.views] == [212]
+    assert [view.camera.width for view in lift.held_out_views] == [212]
 
 
 @pytest.mark.parametrize(
@@ -157,21 +163,41 @@ def call(*arguments: str) -> int:
     return int(end.value.code or 0)
 
 
-def test_the_command_writes_a_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_makes_the_same_sequence_as_the_same_call(
+    rope: Sequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "rope"
-    fixed = ("--object", "rope", "--action", "push", "--seed", "4", "--preset", "clean")
-    quick = ("--frames", "3", "--images", "none", "--resolution", "tiny", "--cameras", "1")
+    fixed = ("--object", "rope", "--action", "push", "--seed", "4")
+    quick = ("--frames", "8", "--images", "none", "--resolution", "tiny")
+    assert call(*fixed, *quick, "--out", str(out)) == 0
+    assert str(out) in capsys.readouterr().out
+    assert Sequence.load(out).fingerprint() == rope.fingerprint()
+
+
+def test_the_command_hands_on_what_is_chosen(
+    rope: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def made(*named: str, **chosen: Any) -> Sequence:
+        asked.update(chosen, named=named)
+        return rope
+
+    monkeypatch.setattr(generator, "synthesize", made)
+    fixed = ("--object", "rope", "--action", "push", "--preset", "clean", "--cameras", "1")
     change = ("--change", "depth_noise=0.05", "track_noise=0.5")
     aside = ("--image-size", "quarter", "--held-out-view")
-    assert call(*fixed, *quick, *change, *aside, "--out", str(out)) == 0
-    assert str(out) in capsys.readouterr().out
-    sequence = Sequence.load(out)
-    assert sequence.provenance["synthesize"]["changes"] == {
-        "depth_noise": 0.05,
-        "track_noise": 0.5,
+    assert call(*fixed, *change, *aside, "--out", str(tmp_path / "rope")) == 0
+    expected = {
+        "named": ("rope",),
+        "action": "push",
+        "preset": "clean",
+        "cameras": 1,
+        "changes": {"depth_noise": 0.05, "track_noise": 0.5},
+        "image_size": "quarter",
+        "held_out_view": True,
     }
-    assert [view.camera.width for view in sequence.views] == [212]
-    assert [view.camera.width for view in sequence.held_out_views] == [212]
+    assert asked | expected == asked
 
 
 @pytest.mark.parametrize(
