@@ -187,11 +187,24 @@ def create_app(
     for router in routers:
         # Taken over, not included: that would build each route once more at the first request.
         app.routes.extend(router.routes)
-    app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
+    app.mount("/assets", _Assets(directory=WEB_ASSETS), name="assets")
 
     _answer_errors(app, pages)
     _guard(app, security, figures, audit_log, root_path=settings.root_path)
     return app
+
+
+class _Assets(StaticFiles):
+    """Scripts and styles of pages: browsers keep them, and ask at each page if they are the same.
+
+    A new version of the program changes them without their addresses.
+    """
+
+    def file_response(self, *args: Any, **options: Any) -> Response:
+        """Answer with the file, or that it is the one that the browser has."""
+        response = super().file_response(*args, **options)
+        response.headers["Cache-Control"] = "private, no-cache"
+        return response
 
 
 def _while_serving(

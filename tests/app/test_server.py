@@ -71,6 +71,18 @@ def test_the_printed_address_lets_a_browser_in(world: World) -> None:
     assert client.get("/healthz").json()["status"] == "ok"
 
 
+def test_browsers_keep_scripts_and_ask_whether_they_are_the_same(still_world: World) -> None:
+    client = still_world.browser()
+    script = client.get("/assets/app.js")
+    assert script.headers["cache-control"] == "private, no-cache"
+    again = client.get("/assets/app.js", headers={"If-None-Match": script.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert again.headers["cache-control"] == "private, no-cache"
+    changed = client.get("/assets/app.js", headers={"If-None-Match": '"another"'})
+    assert (changed.status_code, changed.content) == (200, script.content)
+    assert client.get("/").headers["cache-control"] == "no-store"
+
+
 def test_the_token_never_reaches_a_log_or_a_page(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
