@@ -14,7 +14,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.run import Run
 from physhandi.synthetic.code_version import generator_version
-from physhandi.synthetic.suite.suite import FLOOR, SUITES, find_suite
+from physhandi.synthetic.suite.suite import FLOOR, SUITES, SuiteScene, find_suite
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -139,8 +139,9 @@ def test_the_tiny_suite_is_made_by_one_command_and_taken_up_by_the_next(
     tiny = replace(
         tiny,
         methods=("static", "quick", FLOOR, "oracle_hand"),
-        seeds=(3,),  # MuJoCo lifts its cloth in two thirds of the time.
-        recording={**tiny.recording, "frames": 14},
+        scenes=(SuiteScene(object_="rope", action="lift"),),  # MuJoCo's cloth takes thrice as long.
+        settings={**tiny.settings, "node_spacing": 0.012, "simulation.connection_radius": 0.02},
+        recording={**tiny.recording, "frames": 18},
     )
     monkeypatch.setitem(SUITES, "tiny", tiny)
     # The process that makes the sequence fills the only cell, too.
@@ -156,13 +157,13 @@ def test_the_tiny_suite_is_made_by_one_command_and_taken_up_by_the_next(
     rows = rows_of(out / "table.csv")
     assert alone.items() <= rows.items()  # What was known stays.
     assert tuple(dict.fromkeys(method for method, *_ in rows)) == tiny.methods
+    still = rows["static", "future", "track_error"]  # Until then it has hardly moved.
+    assert still > 0.004
+    for method in ("quick", "oracle_hand"):  # Another engine made it: true hands are not perfect.
+        assert 0.001 < rows[method, "future", "track_error"] < 0.5 * still
     for split in ("reconstruction", "future"):
-        still = rows["static", split, "track_error"]
-        assert 0.001 < rows["quick", split, "track_error"] < 0.8 * still
-        # Another engine made it: the true hand does not make a perfect object.
-        assert 0.001 < rows["oracle_hand", split, "track_error"] < still
         # Nodes carried by the truth miss what was observed by their spacing alone.
-        assert rows["true_motion", split, "track_error"] < 0.003
+        assert rows["true_motion", split, "track_error"] < 0.001
         floor = rows["true_motion", split, "chamfer_phystwin"]
         assert 0.001 < floor < rows["quick", split, "chamfer_phystwin"]
     assert 0.001 < rows["quick", "hands", "mpjpe"] < 0.02
