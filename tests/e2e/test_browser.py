@@ -4,6 +4,7 @@ import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -139,6 +140,8 @@ def test_a_scene_opens_plays_and_saves_what_it_shows(home, fitted, tmp_path, pic
     if home.locator("[data-first-hint]").is_visible():  # A picture was taken without it.
         home.get_by_role("button", name="Got it").click()
     home.reload(wait_until="load")
+    # Before that, this tab has hung up: it is not sent on to a copy of its scene.
+    assert urlsplit(inside.url).path in {urlsplit(frame.url).path for frame in home.frames}
     assert home.evaluate("localStorage.getItem('physhandi.first-hint')") == "seen"
     expect(home.locator("[data-first-hint]")).to_be_hidden()
 

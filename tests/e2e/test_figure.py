@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, expect
-from scene_page import TIMEOUT_MS, ScenePage
+from playwright.sync_api import expect
+from scene_page import ScenePage
 
 pytestmark = pytest.mark.e2e
 FRAME = 30
@@ -70,14 +70,13 @@ def test_the_figure_shows_both_topologies_in_one_picture(
     scene.until(lambda: scene.has("Compare with PhysTwin"), "the scene")
 
 
-def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, served) -> None:
+def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage) -> None:
     scene = shared_scene
     scene.tab("Physics")
     scene.go(FRAME)
     scene.set("stiffness", 0.1)
     difference, address = scene.new_difference("another rollout"), scene.page.url
     shown = *scene.springs(), difference
-    radius = scene.value("δ object [mm]")
 
     second = scene.page.context.new_page()
     second.goto(address)
@@ -86,28 +85,13 @@ def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, ser
     original = address.partition("?")[0]
     copied.until(lambda: second.url.partition("?")[0] != original, "an address of its own")
     copied.until(lambda: copied.value("Frame") == copied.frame() == FRAME, "the same frame")
-    copied.set("δ object [mm]", 60)
-    copied.new_difference("a rollout of its own", difference)
-    copied.until(lambda: copied.springs()[0] not in {None, shown[0]}, "springs of its own")
-    scene.until(lambda: scene.rollout() == shown, "the first tab as it was")
-    assert (scene.value("Frame"), scene.value("δ object [mm]")) == (FRAME, radius)
+    copied.go(FRAME + 2)
+    assert (scene.value("Frame"), scene.frame()) == (FRAME, FRAME)
     # It is not merely frozen: it answers its own user.
     scene.tab("Play")
     scene.press("1 ▶")
     scene.until(lambda: scene.value("Frame") == FRAME + 1, "a step by one frame")
+    assert copied.frame() == FRAME + 2
     scene.tab("Physics")
-
-    own = second.url.partition("?")[0]  # What follows is the state, which changes.
-    second.reload()
-    copied.until(lambda: copied.has("object springs"), "the scene again")
-    assert second.url.partition("?")[0] == own
-    copied.until(lambda: copied.value("δ object [mm]") == 60, "its radius")
-
-    stranger = browser.new_context(reduced_motion="reduce").new_page()
-    stranger.set_default_timeout(TIMEOUT_MS)
-    stranger.goto(served.url)
-    assert stranger.goto(address).status == 404
-    expect(stranger.locator("main")).to_contain_text("belongs to another browser")
-    stranger.context.close()
     second.close()
     scene.press("Reset")
