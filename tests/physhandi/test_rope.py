@@ -1,4 +1,4 @@
-"""A real rope: fitted on half of a trajectory, it predicts two that it never saw."""
+"""A real rope: fitted on the first third of a trajectory, it predicts two that it never saw."""
 
 from pathlib import Path
 
@@ -16,9 +16,9 @@ from physhandi.run import Run
 @pytest.mark.no_cover  # Quick tests of each stage go through the same lines.
 def test_a_rope_predicts_trajectories_it_was_not_fitted_on(tmp_path: Path) -> None:
     folder = recording("rope_mocap")
-    half = tmp_path / "trajectory_048.npy"
-    np.save(half, np.load(folder / half.name)[:250])
-    for path in (half, folder / "trajectory_052.npy", folder / "trajectory_053.npy"):
+    part = tmp_path / "trajectory_048.npy"
+    np.save(part, np.load(folder / part.name)[:150])
+    for path in (part, folder / "trajectory_052.npy", folder / "trajectory_053.npy"):
         import_mocap(path, tmp_path / "sequences")
     config = load_profile("default")
     config = config.replace(object_=config.object_.replace(rope_steps=1))

@@ -30,7 +30,7 @@ def bundled():
 def test_the_towel_stays_within_a_millimetre_of_the_reference(device):
     model, parameters, control = bundled()
     result = benchmark_substeps(
-        model, parameters, control, name="towel", device=device, substeps=(1334,)
+        model, parameters, control[:40], name="towel", device=device, substeps=(300,)
     )
     assert json.loads(json.dumps(result)) == result
     assert result["motion_m"] > 0.1
@@ -40,7 +40,7 @@ def test_the_towel_stays_within_a_millimetre_of_the_reference(device):
     assert result["mean_difference_m"] < result["worst_frame_mean_difference_m"] < 1e-3
     assert result["worst_frame_mean_difference_m"] < result["max_abs_difference_m"]
     table = {row["substeps"]: row for row in result["table"]}
-    assert set(table) == {result["substeps"], parameters.substeps_per_frame, 666, 667, 700, 1334}
+    assert set(table) == {result["substeps"], parameters.substeps_per_frame, 300, 666, 667, 700}
     assert table[667]["max_abs_difference_m"] == 0.0
     assert [row["substeps"] for row in result["scatter_of_reference"]] == [666, 700]
     for row in table.values():

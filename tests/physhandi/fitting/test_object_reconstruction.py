@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stopped_fits import ORIGIN, Stopper, check_resumed, same_bits, write_always
+from stopped_fits import ORIGIN, check_resumed, same_bits, write_always
 
 from physhandi.data.checkpoint import Checkpointer, FileCheckpointer
 from physhandi.data.observation import ObjectObservation
@@ -222,14 +222,17 @@ def test_a_stopped_search_goes_on_to_the_same_bits(
     )
     settings = settings.replace(search=search)
 
+    whole = []
+
     def fit(progress: Progress, checkpointer: Checkpointer | None) -> Any:
-        return search_object([problem], PARAMETERS, settings, progress, checkpointer=checkpointer)
+        found = search_object([problem], PARAMETERS, settings, progress, checkpointer=checkpointer)
+        whole.append(found)
+        return found
 
     reports = check_resumed(fit, tmp_path, (2, 3))
     # The second attempt repeated the second generation, told of it, and computed two more.
     assert [report[1] for report in reports] == [4, 5]
-    whole = fit(Stopper(), None)
-    assert whole.widened == ("stiffness",)
+    assert [found.widened for found in whole] == [("stiffness",)] * 2
     # Losses of other candidates, as of another version of the strategy, are not taken for theirs.
     other = settings.replace(search=search.replace(seed=7))
     checkpointer = FileCheckpointer(tmp_path, ORIGIN)

@@ -90,10 +90,9 @@ def moved(fitted: FittedObject) -> float:
     return float(np.linalg.norm(offset, axis=2).max())
 
 
-@pytest.mark.parametrize(("turn", "ground"), [(0.0, 0.0), (0.9, 0.3), (3.3, -0.25)])
-def test_what_rests_in_one_recording_rests_in_another(runs, tmp_path, turn, ground) -> None:
+def test_what_rests_in_one_recording_rests_in_another(runs, tmp_path) -> None:
     # Other waves: rigidly laid, nodes would be up to 4 mm below where they rest, and jump.
-    recording = write_cloth(tmp_path / "other", shift=2.5, turn=turn, ground=ground, is_held=False)
+    recording = write_cloth(tmp_path / "other", shift=2.5, turn=3.3, ground=-0.25, is_held=False)
     placed = runs[True].object.placed_in(recording, NullProgress())
     assert placed.model.virtual_spring_count == 0
     assert moved(placed) < 5e-4

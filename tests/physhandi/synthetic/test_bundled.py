@@ -19,7 +19,7 @@ from physhandi.simulation.parameters import PARAMETERS
 from physhandi.simulation.topology import virtual_springs
 
 SMALL = Recipe(
-    frame_count=8,
+    frame_count=5,
     size=(120, 90),
     focal_length=146.0,
     spacing=0.010,
@@ -69,10 +69,10 @@ def test_a_small_sequence_is_whole_and_says_where_it_comes_from(small):
     small.validate()
     assert small.missing("color", "depth", "mask", "keypoint", "track", "hands") == []
     assert small.label == "simulated by this project"
-    assert len(small.reconstruction_frames) == 6
+    assert len(small.reconstruction_frames) == 4
     for view in small.views:
         assert view.keypoint is not None
-        assert view.keypoint.shape == (8, 1, 21, 3)
+        assert view.keypoint.shape == (5, 1, 21, 3)
         labels = np.unique(view.mask(0)).tolist()
         assert labels == [0, 1, 2]
         assert 30 <= view.track.shape[1] <= 60
@@ -111,10 +111,11 @@ def test_the_truth_is_told_on_request(small, told, truth):
     view = told.views[0]
     pixel = view.camera.project(known.hand_keypoint["right"].astype(np.float64))
     assert np.nanmedian(np.linalg.norm(view.keypoint[:, 0, :, :2] - pixel, axis=-1)) < 3.0
-    assert np.median(np.linalg.norm(pixel[-1] - pixel[0], axis=-1)) > 10.0
+    # The hand moves by more than its keypoints err.
+    assert np.median(np.linalg.norm(pixel[-1] - pixel[0], axis=-1)) > 8.0
     assert known.contact is not None
     assert known.contact_point is not None
-    assert known.contact.shape == (8, len(truth.sheet.node))
+    assert known.contact.shape == (5, len(truth.sheet.node))
     distance = cKDTree(truth.control[0]).query(known.contact_point)[0]
     # The generator joins up to four nodes nearer than 9 mm to each of the hand's vertices.
     assert distance[known.contact[0]].max() < 0.009
@@ -123,7 +124,7 @@ def test_the_truth_is_told_on_request(small, told, truth):
 
 def test_what_is_lifted_lies_on_what_was_simulated(small, truth):
     observation = observe_object(small)
-    for frame in (0, 7):
+    for frame in (0, 4):
         face = truth.sheet.faces
         corner = truth.position[frame][face]
         surface = np.concatenate([corner.mean(axis=1), corner.reshape(-1, 3)])

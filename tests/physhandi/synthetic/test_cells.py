@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +184,20 @@ def test_a_look_is_fitted_once_for_all_methods_unless_the_order_leaves_it_out(
 # What a cell is found again by
 
 
+@cache
+def imported_by(file: str) -> tuple[str, ...]:
+    """Files of the library that one of it imports."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse((LIBRARY / file).read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    ours = [name.removeprefix("physhandi.") for name in names if name.startswith("physhandi.")]
+    paths = [name.replace(".", "/") + ".py" for name in ours]
+    return tuple(path for path in paths if (LIBRARY / path).is_file())
+
+
 def needed(start: tuple[str, ...], without: tuple[str, ...]) -> set[str]:
     """Follow the imports of files of the library; some are left out."""
     found: set[str] = set()
@@ -192,16 +207,7 @@ def needed(start: tuple[str, ...], without: tuple[str, ...]) -> set[str]:
         if file in found or file.startswith(without):
             continue
         found.add(file)
-        for node in ast.walk(ast.parse((LIBRARY / file).read_text())):
-            names: list[str] = []
-            if isinstance(node, ast.Import):
-                names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.module is not None:
-                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            for name in names:
-                if name.startswith("physhandi."):
-                    path = name.removeprefix("physhandi.").replace(".", "/") + ".py"
-                    waiting += [path] if (LIBRARY / path).is_file() else []
+        waiting += imported_by(file)
     return found
 
 

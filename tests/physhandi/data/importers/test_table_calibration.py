@@ -140,7 +140,7 @@ def photograph(camera: PinholeCamera, sheet: np.ndarray, frame: int) -> np.ndarr
 
 
 def test_cameras_find_each_other_by_a_printed_table(tmp_path: Path) -> None:
-    cameras = {"left": camera_at(30, scale=3), "right": camera_at(85, scale=3)}
+    cameras = {"left": camera_at(30, scale=2), "right": camera_at(85, scale=2)}
     raw = RawCapture(tmp_path / "raw", cameras).write(2, poses=False)
     with pytest.raises(ImportFailedError, match="give --by-table if"):
         import_capture(raw.folder, tmp_path / "none")
