@@ -300,7 +300,13 @@ def test_the_fit_reports_and_stops_when_asked(tmp_path: Path) -> None:
 @pytest.mark.no_cover  # Made-up hands go through the same lines.
 def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
     whole = import_stereo(recording("stereo_hand"), tmp_path / "hand")
-    # The first of its 378 frames: to find keypoints in all of them takes longer than to fit them.
+    assert (whole.frame_count, whole.frame_rate) == (378, 30.0)
+    assert whole.views[0].color(100).shape == (720, 720, 3)
+    left, right = (view.camera.T_world_camera for view in whole.views)
+    assert min(left[2, 3], right[2, 3]) > 14
+    stated = [0.29888, 0.83498, -0.46204]
+    np.testing.assert_allclose((np.linalg.inv(right) @ left)[0, :3], stated, atol=0.02)
+    # The first of its frames: to find keypoints in all of them takes longer than to fit them.
     sequence = Sequence(whole.folder, replace(whole.meta, frame_count=RECORDED))
     keypoint = detect_sequence(sequence)
     # A tenth of what was seen is kept from the fit, to score it.

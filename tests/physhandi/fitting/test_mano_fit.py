@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from physhandi import pipeline
 from physhandi.data.exporters import export_run
+from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, UsageError
 from physhandi.fitting.artefacts import load_model, load_motions
 from physhandi.fitting.config import HandFitConfig, PipelineConfig, load_profile
@@ -123,6 +124,18 @@ def finished_after_a_stop(place: Path, folder: Path) -> Run:
     return Run.open(run.folder)
 
 
+def measured_without_hand_points(run: Run, folder: Path) -> dict[str, Any]:
+    """Measure a run from which the points of its hand are taken away."""
+    points = list(run.out.rglob("hand_point*.npy"))
+    assert points
+    for path in points:
+        path.unlink()
+    measured = pipeline.evaluate(run, [Sequence.load(folder)])["towel_fold"]
+    assert 0.002 < measured["hands"]["right"]["chamfer_points_to_mesh"] < 0.005
+    assert measured["contact"]["frame_0"]["accuracy_10mm"] > 0.8
+    return measured
+
+
 @pytest.mark.slow
 def test_a_whole_run_refines_mano_goes_on_after_a_stop_and_outlives_mano(
     tmp_path: Path, mano: Path, monkeypatch: pytest.MonkeyPatch
@@ -176,3 +189,5 @@ def test_a_whole_run_refines_mano_goes_on_after_a_stop_and_outlives_mano(
     for file in (f"{base}/hand_right_{part}.npy" for part in ("vertex", "face", "keypoint")):
         np.testing.assert_array_equal(again.array(file), run.array(file))
     assert export_run(again, "gltf", tmp_path / "again.glb").stat().st_size > 100_000
+    # Without points of the hand a run is measured with those of its sequence.
+    assert measured_without_hand_points(run, folder) == run.json("metrics.json")["towel_fold"]

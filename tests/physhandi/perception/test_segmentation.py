@@ -60,7 +60,7 @@ def test_hands_are_found_from_keypoints_and_are_never_the_object(held_disc):
 
 
 def test_the_object_is_not_the_fingers_behind_it(tmp_path):
-    sequence, true = write_disc(tmp_path / "over", hand=True, top=ABOVE_HAND)
+    sequence, true = write_disc(tmp_path / "over", hand=True, frames=5, top=ABOVE_HAND)
     found = segment(sequence, [Click(*disc_click(top=ABOVE_HAND))])
     for view, label in found.items():
         assert ((label > 1) & (true[view] == 1)).sum() < 0.02 * (true[view] == 1).sum()
@@ -69,7 +69,7 @@ def test_the_object_is_not_the_fingers_behind_it(tmp_path):
 
 
 def test_a_hand_that_one_view_does_not_detect_is_shown_to_it_by_the_other(tmp_path):
-    sequence, true = write_disc(tmp_path / "held", hand=True)
+    sequence, true = write_disc(tmp_path / "held", hand=True, frames=5)
     path = sequence.folder / "views" / "side" / "keypoint.npy"
     np.save(path, np.full_like(np.load(path), np.nan))
     found = segment(type(sequence).load(sequence.folder), [Click(*disc_click())])

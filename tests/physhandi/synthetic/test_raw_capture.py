@@ -1,6 +1,7 @@
 """What is written as a raw capture is a recorder's: no masks, no poses, depth of the table too."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -44,8 +45,13 @@ def sequence(tmp_path_factory) -> Sequence:
         )
 
 
-def test_a_capture_holds_what_a_recorder_writes_and_nothing_else(sequence, tmp_path):
-    folder = write_raw_capture(sequence, tmp_path / "raw")
+@pytest.fixture(scope="module")
+def folder(sequence, tmp_path_factory) -> Path:
+    """The raw capture of it, which nothing changes."""
+    return write_raw_capture(sequence, tmp_path_factory.mktemp("captured") / "raw")
+
+
+def test_a_capture_holds_what_a_recorder_writes_and_nothing_else(folder):
     files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
     of_view = ["color/00000.png", "color/00001.png", "depth/00000.png", "depth/00001.png"]
     of_view += ["intrinsics.json", "timestamps.txt"]
@@ -57,11 +63,10 @@ def test_a_capture_holds_what_a_recorder_writes_and_nothing_else(sequence, tmp_p
     assert set(json.loads((folder / "camera0/intrinsics.json").read_text())) == {
         *("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
     }
-    assert [path.name for path in tmp_path.iterdir()] == ["raw"]
+    assert [path.name for path in folder.parent.iterdir()] == ["raw"]
 
 
-def test_depth_of_the_table_is_measured_where_the_sequence_keeps_none(sequence, tmp_path):
-    folder = write_raw_capture(sequence, tmp_path / "raw")
+def test_depth_of_the_table_is_measured_where_the_sequence_keeps_none(folder):
     depth = cv2.imread(str(folder / "camera0/depth/00001.png"), cv2.IMREAD_UNCHANGED) / 1000.0
     true = picture(CAMERAS["camera0"], 1)[1]
     known = depth > 0
@@ -71,8 +76,7 @@ def test_depth_of_the_table_is_measured_where_the_sequence_keeps_none(sequence, 
     assert error[true[known & (true > 0)] < 1].mean() > 1e-4  # As noisy as a sensor.
 
 
-def test_the_board_s_pictures_give_the_cameras_back(sequence, tmp_path):
-    folder = write_raw_capture(sequence, tmp_path / "raw")
+def test_the_board_s_pictures_give_the_cameras_back(folder, tmp_path):
     imported = import_capture(folder, tmp_path / "back")  # It tells which board it is.
     assert imported.provenance["calibration"]["by"].startswith("board, ChArUco, 5x4 squares")
     found = [view.camera.T_world_camera for view in imported.views]

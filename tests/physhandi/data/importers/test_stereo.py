@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 from header_bombs import mp4
-from recordings import recording as published
 
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.errors import ImportFailedError, UsageError
@@ -151,15 +150,3 @@ def test_videos_must_be_there_once_decode_and_agree(recording: Path, tmp_path: P
     _video(recording / "cam0_again.mp4")
     with pytest.raises(ImportFailedError, match=r"found cam0_again\.mp4, cam0_test\.mp4"):
         import_stereo(recording, tmp_path / "hand")
-
-
-def test_the_published_recording_is_imported(tmp_path: Path) -> None:
-    sequence = import_stereo(published("stereo_hand"), tmp_path / "hand")
-    assert (sequence.frame_count, sequence.frame_rate) == (378, 30.0)
-    assert sequence.views[0].color(100).shape == (720, 720, 3)
-    centers = [view.camera.T_world_camera[:3, 3] for view in sequence.views]
-    assert min(center[2] for center in centers) > 14
-    between = np.array([[0.29888], [0.83498], [-0.46204]])
-    relative = np.linalg.inv(sequence.views[1].camera.T_world_camera)
-    relative = relative @ sequence.views[0].camera.T_world_camera
-    np.testing.assert_allclose(relative[0, :3], between[:, 0], atol=0.02)
