@@ -78,16 +78,6 @@ def test_a_known_hand_is_found_again_and_frames_that_no_view_saw_are_bridged(
     assert np.abs(np.diff(fit.motions[0].wrist_rotation, axis=0)).max() < 0.3
 
 
-def test_the_same_input_gives_the_same_bits(tmp_path: Path) -> None:
-    truth = scene.grasping(frames=4)
-    keypoint = scene.seen_keypoints([truth], CAMERAS, noise=1.0)
-    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
-    config = HandFitConfig(iterations=30)
-    first, second = (reconstruct_hands(sequence, config).motions[0] for _ in range(2))
-    for name, array in first.to_tensors().items():
-        assert np.array_equal(array, second.to_tensors()[name]), name
-
-
 def test_both_hands_and_the_scale_of_a_sequence_without_metres(tmp_path: Path) -> None:
     motions = [scene.grasping("right", scale=20.0), scene.grasping("left", scale=20.0)]
     cameras = []
@@ -182,7 +172,7 @@ def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_on
         config = HandFitConfig(
             iterations=60, depth_iterations=60, starts_at_depth=is_new, fixed_normals=is_new
         )
-        assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.012
+        assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.007
 
 
 def test_the_way_to_measured_depth_is_along_the_line_of_sight() -> None:
@@ -226,6 +216,7 @@ def test_a_hand_that_nobody_sees_does_not_stop_the_other(tmp_path: Path) -> None
     )
     assert alone.left_out == {}
     assert (both.loss_before, both.loss_after) == (alone.loss_before, alone.loss_after)
+    # The same input gives the same bits.
     for name, array in alone.motions[0].to_tensors().items():
         assert np.array_equal(array, both.motions[0].to_tensors()[name]), name
 
@@ -361,8 +352,8 @@ def test_of_two_hands_the_first_is_not_fitted_again(
     sequence = scene.write_scene(tmp_path / "a", motions, CAMERAS, keypoint)
 
     def fit(progress: Progress, checkpointer: Checkpointer | None) -> HandFit:
-        config = HandFitConfig(iterations=30, depth_iterations=0)
+        config = HandFitConfig(iterations=20, depth_iterations=0)
         return reconstruct_hands(sequence, config, progress, checkpointer=checkpointer)
 
-    reports = check_resumed(fit, tmp_path / "ckpt", (5,))
-    assert [report[1] for report in reports] == [30, 20, 30]
+    reports = check_resumed(fit, tmp_path / "ckpt", (3,))
+    assert [report[1] for report in reports] == [20, 10, 20]

@@ -201,9 +201,9 @@ def test_the_gradient_agrees_with_central_differences_in_float64(
 
 def test_a_shift_of_the_whole_hand_is_found_with_its_sign_and_size() -> None:
     # Nothing else acts on the nodes, so in rest they are displaced as the hand is.
-    truth, shift = standing(12), (0.006, -0.004, 0.003)
-    problem = held_patch((truth,), (moved(truth, shift),), fitted=12)
-    config = FREE.replace(rotation_rate=0.0, articulation_rate=0.0, iterations=60)
+    truth, shift = standing(8), (0.006, -0.004, 0.003)
+    problem = held_patch((truth,), (moved(truth, shift),), fitted=8)
+    config = FREE.replace(rotation_rate=0.0, articulation_rate=0.0, iterations=40)
     result = refine_hands(problem, config, NullProgress())
     found = result.motions[0].wrist_translation - problem.motions[0].wrist_translation
     np.testing.assert_allclose(found[2:].mean(axis=0), -np.array(shift), atol=3e-4)

@@ -61,7 +61,7 @@ def test_tables_are_written_after_each_protocol_and_survive_a_crash(
     assert "**Not finished**: 4 cells" in (tmp_path / "report.md").read_text()
 
 
-def test_tables_of_a_long_protocol_are_written_on_the_way(
+def test_tables_are_written_on_the_way_and_an_order_of_fewer_methods_keeps_what_was_known(
     tmp_path: Path, recordings: tuple[Sequence, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known: list[int] = []
@@ -72,17 +72,12 @@ def test_tables_of_a_long_protocol_are_written_on_the_way(
                 file = tmp_path / "cells.json"
                 known.append(len(json.loads(file.read_text())["cells"]) if file.is_file() else 0)
 
-    order = order_of(recordings, methods=("static", "rigid_follow"), protocols=("main",))
-    monkeypatch.setattr(evaluation, "WRITE_EVERY", -1.0)
-    evaluate_suite(order, tmp_path, Listener())
-    assert known == [0, 1, 2, 3, 3]  # Told before each cell; the last one is written at the end.
-
-
-def test_an_order_of_fewer_methods_keeps_what_was_known(
-    tmp_path: Path, recordings: tuple[Sequence, ...]
-) -> None:
     whole = order_of(recordings, methods=("static", "rigid_follow"))
-    evaluate_suite(whole, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "WRITE_EVERY", -1.0)
+        evaluate_suite(whole, tmp_path, Listener())
+    # Told before each cell; the last one is written at the end.
+    assert known == [*range(8), 7]
     before = (tmp_path / "table.csv").read_bytes()
     report = (tmp_path / "report.md").read_text().partition("## Computed with")[0]
     evaluate_suite(replace(whole, methods=("rigid_follow",), protocols=("main",)), tmp_path)
