@@ -104,7 +104,7 @@ def kill_after(count: int, child: Any, written: Any, run: Run) -> None:
         assert child.is_alive()
         return holder_of(run.folder) == child.pid and written.value >= count
 
-    until(has_written, interval=0.0002)
+    until(has_written, interval=0.001)
     os.kill(child.pid, signal.SIGKILL)
 
 

@@ -8,11 +8,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, KDTree
 
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.observation import ObjectObservation
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.perception.lifting import observe_object
-from physhandi.perception.shape import shape_of_observation
+from physhandi.perception.shape import ObjectShape, shape_of_observation
 from physhandi.perception.shape_class import links
 from physhandi.rendering.renderer import rasterize
 from physhandi.rendering.shapes import Balls, Surface
@@ -78,9 +79,19 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
         )
 
 
-def test_a_cloth_held_up_becomes_one_sheet_without_background(held: Sequence) -> None:
-    observation = observe_object(held)
-    shape = shape_of_observation(observation, SPACING, held)
+@pytest.fixture(scope="module")
+def observation(held: Sequence) -> ObjectObservation:
+    return observe_object(held)
+
+
+@pytest.fixture(scope="module")
+def shape(held: Sequence, observation: ObjectObservation) -> ObjectShape:
+    return shape_of_observation(observation, SPACING, held)
+
+
+def test_a_cloth_held_up_becomes_one_sheet_without_background(
+    observation: ObjectObservation, shape: ObjectShape
+) -> None:
     surface = made.hanging(RELIEF, size=SIZE)
     away = KDTree(surface).query(observation.cloud[0])[0]
     assert (away > 0.1).sum() > 300  # What the masks let through.
@@ -95,15 +106,16 @@ def test_a_cloth_held_up_becomes_one_sheet_without_background(held: Sequence) ->
     assert connected_components(graph, directed=False)[0] == 1
 
 
-def test_the_background_is_named(held: Sequence) -> None:
-    (warning,) = shape_of_observation(observe_object(held), SPACING, held).warnings
+def test_the_background_is_named(shape: ObjectShape) -> None:
+    (warning,) = shape.warnings
     assert warning["code"] == "object_points_removed"
     assert "behind or beside it according to another view (up to" in warning["message"]
 
 
-def test_what_a_hand_hides_is_filled_and_nothing_beside_the_cloth(held: Sequence) -> None:
-    observation = observe_object(held)
-    node = shape_of_observation(observation, SPACING, held).node
+def test_what_a_hand_hides_is_filled_and_nothing_beside_the_cloth(
+    observation: ObjectObservation, shape: ObjectShape
+) -> None:
+    node = shape.node
     middle = np.array([0.0, 0.0, 0.6])
     hidden = [
         np.linalg.norm(p[:, [0, 2]] - middle[[0, 2]], axis=1) < 0.02

@@ -20,6 +20,12 @@ def disc(tmp_path_factory):
     return write_disc(tmp_path_factory.mktemp("track") / "disc")
 
 
+@pytest.fixture(scope="module")
+def found(disc):
+    """The tracks of all of it."""
+    return track_points(*disc)
+
+
 def true_paths(view: str, pixel: np.ndarray, is_seen: np.ndarray) -> np.ndarray:
     """Where the points of the disc that tracks begin on are in every frame [px]."""
     camera = cameras()[view]
@@ -37,9 +43,7 @@ def true_paths(view: str, pixel: np.ndarray, is_seen: np.ndarray) -> np.ndarray:
     return paths
 
 
-def test_tracks_follow_the_surface_to_a_part_of_a_pixel(disc):
-    sequence, labels = disc
-    found = track_points(sequence, labels)
+def test_tracks_follow_the_surface_to_a_part_of_a_pixel(found):
     assert set(found) == {"top", "side"}
     for view, (pixel, is_seen) in found.items():
         assert pixel.dtype == np.float32
@@ -52,9 +56,9 @@ def test_tracks_follow_the_surface_to_a_part_of_a_pixel(disc):
         assert is_seen.all(axis=0).sum() > 50
 
 
-def test_enough_tracks_live_in_every_frame_and_none_off_the_object(disc):
-    sequence, labels = disc
-    for view, (pixel, is_seen) in track_points(sequence, labels).items():
+def test_enough_tracks_live_in_every_frame_and_none_off_the_object(disc, found):
+    _, labels = disc
+    for view, (pixel, is_seen) in found.items():
         assert 600 < (labels[view] == 1).sum(axis=(1, 2)).min() < 900
         assert is_seen.sum(axis=1).min() >= 150
         for frame in range(FRAMES):
