@@ -109,9 +109,10 @@ _RIDES_ALONG = {("palm_length", "thumb_set"), ("palm_width", "thumb_set")}
 
 
 def _measure(hand: OpenHand, name: str, shape: Tensor) -> float:
-    bone, vertex = hand.bone_origins(shape).numpy(), _pose(hand, shape=shape).vertex[0].numpy()
+    bone = hand.bone_origins(shape).numpy()
     thumb, index, middle, pinky = 1, 4, 7, 13
     if name == "size":
+        vertex = _pose(hand, shape=shape).vertex[0].numpy()
         return float(np.linalg.norm(vertex[0] - vertex[500]))
     if name == "palm_length":
         return float(np.linalg.norm(bone[middle]))
@@ -121,6 +122,7 @@ def _measure(hand: OpenHand, name: str, shape: Tensor) -> float:
         return float(np.linalg.norm(bone[thumb]))
     if name == "finger_thickness":
         joint = JOINT_NAMES.index("middle_dip")
+        vertex = _pose(hand, shape=shape).vertex[0].numpy()
         rigid = vertex[hand.weight[:, joint + 1] > 1 - 1e-9]
         return float(np.ptp((rigid - bone[joint + 1]) @ hand.joint_axes[joint][:, 0]))
     first = 1 + 3 * _FINGERS.index(name)

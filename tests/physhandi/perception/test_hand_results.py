@@ -54,12 +54,10 @@ def pixels(point: np.ndarray, focal: float = 140.0) -> np.ndarray:
     return focal * point[:, :2] / point[:, 2:] + [WIDTH / 2, HEIGHT / 2]
 
 
-@pytest.mark.parametrize("ending", ["json", "npz"])
-def test_pixels_of_a_view_become_its_keypoints(tmp_path, sequence, ending):
+def test_pixels_of_a_view_become_its_keypoints(tmp_path, sequence):
     shown = np.random.default_rng(0).uniform(10, 80, (3, 21, 2))
     path = write(
         tmp_path,
-        ending=ending,
         frame=[5, 2, 5],
         side=["right"] * 3,
         view=["side"] * 3,
