@@ -13,8 +13,9 @@ from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.truth import read_truth
+from physhandi.errors import CancelledError
 from physhandi.perception.lifting import hand_points, observe_object
-from physhandi.progress import NullProgress
+from physhandi.progress import NullProgress, Progress
 from physhandi.synthetic.film.cameras import (
     Viewpoint,
     make_held_out_viewpoint,
@@ -40,6 +41,7 @@ def write(
     delay: float = 0.0,
     held_out: bool = False,
     frames: int = FRAMES,
+    progress: Progress | None = None,
 ) -> Sequence:
     """Record a lifted sheet with two cameras, in small images if there are any."""
     truth = lifted_sheet(frames, sides)
@@ -62,7 +64,7 @@ def write(
             seed=seed,
             images=images,
             held_out=[with_image_size(view, "half") for view in beside],
-            progress=NullProgress(),
+            progress=progress or NullProgress(),
         )
         return writer.finish(describe(folder.name, stage.hands, views, frames))
 
@@ -300,6 +302,23 @@ def test_a_full_disk_leaves_nothing_and_is_told(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"No space left.*00001\.png"):
         write(tmp_path / "full", images="all")
     assert count == 4
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stop_while_it_is_filmed_leaves_nothing(tmp_path):
+    told = []
+
+    class Stops(Progress):
+        def report(self, stage, iteration, total, loss=None, message=""):
+            told.append((stage, iteration, total))
+
+        def check_cancelled(self):
+            if len(told) == 2:
+                raise CancelledError("stopped")
+
+    with pytest.raises(CancelledError):
+        write(tmp_path / "half", progress=Stops())
+    assert told == [("filming", 1, 2 * FRAMES), ("filming", 2, 2 * FRAMES)]
     assert list(tmp_path.iterdir()) == []
 
 
