@@ -272,7 +272,7 @@ def use_often(count: int, folder: Path) -> Report:
 CASES = {
     "R18": Case(
         "A server is used by everybody: fits, cancels, simulations, scenes, files, pages, uploads",
-        *(400, 6, use_often),
+        *(400, 5, use_often),
         last=soak,
         minutes=120.0,
     )

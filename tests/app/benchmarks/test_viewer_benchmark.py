@@ -1,6 +1,7 @@
 """The benchmark of the viewer runs against the real server, and its numbers fit each other."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import pytest
 from scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_WORK
 
 from app import cli
-from app.benchmarks import browser, latency, streams, viewer
+from app.benchmarks import browser, latency, splats, streams, viewer
 from app.benchmarks.parts import PARTS
 from app.benchmarks.scenes import HEAVY, HEAVY_ARROWS, HEAVY_NODES, make_heavy_run, make_many_runs
 from app.benchmarks.served import Served, ServerFailedError
@@ -21,7 +22,9 @@ from app.benchmarks.streams import percentiles
 from app.benchmarks.viewer import GOALS, compare_with_goals, measure_viewer
 from app.jobs.catalog import Catalog
 from app.settings import BUNDLED, ServerSettings
+from app.viewer.content.layers import OBJECT_FORMS, ObjectForm
 from app.viewer.scene.object_drawing import QUIET_FORCE
+from app.viewer.scene.scene import SceneDrawing
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import load_fitted
 from physhandi.run import Run
@@ -60,7 +63,7 @@ def is_in_order(times: dict[str, float]) -> bool:
 def test_clients_with_and_without_a_browser_measure_the_real_server(
     little: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parts = ("paint", "open", "scrub", "slider", "browser", "bytes", "runs", "live")
+    parts = ("paint", "open", "scrub", "slider", "browser", "bytes", "runs")
     code, out, error = call(capsys, "--quick", "--json", "--parts", *parts)
     assert code == 0, error
     result = json.loads(out)
@@ -90,10 +93,6 @@ def test_clients_with_and_without_a_browser_measure_the_real_server(
     assert result["runs"]["/"]["bytes"] > 1000
     assert set(result["figures"]) == {n for n, goal in GOALS.items() if goal.part in parts}
     assert result["figures"]["scrub_p95_ms"]["value"] == result["scrub"]["p95_ms"]
-    live = result["live"]
-    assert live["sequence_frames_per_s"] == 30.0
-    assert live["in_process_ms"] < live["first_new_frame_ms"]
-    assert result["figures"]["live_frames_per_s"]["value"] == live["frames_per_s"]
     paint, opened, slider = (result[part] for part in ("paint", "open", "browser"))
     assert is_in_order(paint)
     assert is_in_order(opened)
@@ -107,30 +106,89 @@ def test_clients_with_and_without_a_browser_measure_the_real_server(
     assert result["figures"]["click_to_result_p95_ms"]["value"] == opened["p95_ms"]
 
 
-@pytest.mark.slow
-def test_the_first_move_after_a_start_is_timed(little: None) -> None:
+def test_the_live_part_tells_of_automatic_substeps_and_of_steering(
+    little: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = Run.open(BUNDLED / "runs" / BUNDLED_RUN)
-    start = measure_viewer(run, "towel_fold", parts=("start",), is_quick=True)["start"]
-    for times in (start, start["nothing_compiled"]):
-        for name in ("server_start_ms", "first_move_ms", "second_move_ms"):
-            assert times[name] > 0.0
+    asked: list[object] = []
+
+    def measured(*about: object, **options: object) -> dict[str, Any]:
+        asked.append((about, options))
+        rate = {"frames_per_s": 31.0}
+        kinds = {
+            f"{slider}, substeps {substeps}": rate | {"of": f"{slider} {substeps}"}
+            for slider in ("stiffness", "radius")
+            for substeps in ("automatic", "as fitted")
+        }
+        steered = {"frames_per_s": 19.0}
+        return {"kinds": kinds, "sequence_frames_per_s": 30.0, "steered": steered, "nodes": 441}
+
+    monkeypatch.setattr(latency, "measure_latency", measured)
+    result = measure_viewer(run, "towel_fold", parts=("live",), is_quick=True)
+    assert asked == [((run, "towel_fold"), {"device": "cpu", "moves": 2})]
+    live = result["live"]
+    assert live.pop("load_average") >= 0.0
+    assert live == {
+        "frames_per_s": 31.0,
+        "of": "stiffness automatic",
+        "sequence_frames_per_s": 30.0,
+        "steered": {"frames_per_s": 19.0},
+    }
+    figures = {name: figure["value"] for name, figure in result["figures"].items()}
+    assert figures == {"live_frames_per_s": 31.0, "steered_frames_per_s": 19.0}
+
+
+@pytest.mark.slow
+def test_the_first_move_after_a_start_is_timed(
+    little: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run.open(BUNDLED / "runs" / BUNDLED_RUN)
+    real, measured = viewer.Served, viewer.measure_first_move
+    monkeypatch.setattr(
+        viewer, "Served", lambda *a, **more: real(*a, **more) if more else nullcontext("compiled")
+    )
+    # Where everything is compiled, less happens than where it is not.
+    monkeypatch.setattr(
+        viewer,
+        "measure_first_move",
+        lambda at, *a: {"first_move_ms": 2.5} if at == "compiled" else measured(at, *a),
+    )
+    result = measure_viewer(run, "towel_fold", parts=("start",), is_quick=True)
+    assert result["figures"]["first_move_after_start_ms"]["value"] == 2.5
+    start = result["start"]["nothing_compiled"]
+    for name in ("server_start_ms", "scene_open_ms", "first_move_ms", "second_move_ms"):
+        assert start[name] > 0.0
     # What must be compiled first takes longer, so that the panel says so.
-    assert start["nothing_compiled"]["is_start_shown"]
+    assert start["is_start_shown"]
 
 
 @pytest.mark.e2e
 @pytest.mark.slow
-def test_splats_are_played_beside_nodes_and_the_surface(little: None) -> None:
+def test_splats_are_played_beside_nodes_and_the_surface(
+    little: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = Run.open(BUNDLED / "runs" / BUNDLED_RUN)
+    real = splats._measure_drawing
+    drawn: list[ObjectForm] = []
+
+    def draw_splats_alone(server: Any, scene: SceneDrawing, *more: Any) -> float:
+        drawn.extend(form for form in OBJECT_FORMS if getattr(scene.layers, form))
+        return real(server, scene, *more) if drawn[-1] == "splats" else 3.0
+
+    monkeypatch.setattr(splats, "_measure_drawing", draw_splats_alone)
     with browser.open_chromium() as chromium:
         result = measure_splats(run, "towel_fold", chromium, 0.5, counts=(400,))
     kinds = result["kinds"]
-    assert set(kinds) == {"nodes", "surface", "splats_400"}
+    assert (list(kinds), drawn) == (
+        ["nodes", "surface", "splats_400"],
+        ["nodes", "surface", "splats"],
+    )
+    assert [kinds[name]["pictures_per_s"] for name in ("nodes", "surface")] == [3.0, 3.0]
+    assert kinds["splats_400"]["pictures_per_s"] > 0.0
     assert result["frame_bytes"] == kinds["splats_400"]["frame_bytes"]
     # The hand alone is 1,159 points of 12 bytes, of which packing leaves more than half.
     assert 8_000 < kinds["splats_400"]["frame_bytes"] < kinds["surface"]["frame_bytes"]
     for kind in kinds.values():
-        assert kind["pictures_per_s"] > 0.0
         assert 0.0 < kind["draw_ms"] < kind["server_ms"]
 
 
@@ -141,14 +199,12 @@ def test_made_splats_lie_on_the_surface_in_its_colors() -> None:
     assert surface is not None
     left = surface.place(node)[:, 0] < 0.1
     color = np.where(left[:, None], [250, 0, 0], [0, 0, 250]).astype(np.uint8)
-    splats = scattered(replace(surface, color=color), node, 2_000)
-    np.testing.assert_allclose(splats.center[:, 2], 0.3, atol=1e-6)
-    np.testing.assert_allclose(splats.center.mean(axis=0)[:2], [0.1, 0.05], atol=0.004)
-    assert splats.scale[0] == pytest.approx(0.7 * np.sqrt(0.02 / 2_000), rel=1e-3)
-    is_left = splats.center[:, 0] < 0.08
-    np.testing.assert_allclose(
-        splats.color[is_left], [[250 / 255, 0, 0]] * is_left.sum(), atol=0.01
-    )
+    made = scattered(replace(surface, color=color), node, 2_000)
+    np.testing.assert_allclose(made.center[:, 2], 0.3, atol=1e-6)
+    np.testing.assert_allclose(made.center.mean(axis=0)[:2], [0.1, 0.05], atol=0.004)
+    assert made.scale[0] == pytest.approx(0.7 * np.sqrt(0.02 / 2_000), rel=1e-3)
+    is_left = made.center[:, 0] < 0.08
+    np.testing.assert_allclose(made.color[is_left], [[250 / 255, 0, 0]] * is_left.sum(), atol=0.01)
 
 
 def test_goals_are_compared_in_the_right_direction() -> None:
