@@ -123,26 +123,6 @@ def post(client: TestClient, address: str = ADDRESS, **fields: Any) -> Any:
     return client.post(address, json=fields)
 
 
-def test_a_click_in_the_browser_finds_masks_and_tracks(world: World) -> None:
-    client = world.script()
-    page = world.browser().get("/sequences/disc/check").text
-    assert 'id="annotation"' in page
-    assert "Replace those that are there" not in page
-    assert client.get(ADDRESS).json()["state"] == "none"
-    view, frame, x, y = disc_click()
-    place = {"view": view, "frame": frame, "x": x, "y": y}
-    answer = post(client, clicks=[place])
-    assert answer.status_code == 202, answer.text
-    job = until(lambda: (j := client.get(ADDRESS).json())["state"] != "running" and j)
-    assert (job["state"], job["reason"]) == ("done", "")
-    assert job["progress"]["stage"] == "point_tracking"
-    found = Sequence.load(world.settings.sequence_dir / "disc")
-    assert found.missing("mask", "track") == []
-    assert found.provenance["masks"]["clicks"] == [place]
-    assert "Replace those that are there" in world.browser().get("/sequences/disc/check").text
-    assert client.delete(ADDRESS).status_code == 204
-
-
 def test_a_recording_is_not_changed_while_a_fit_reads_it(world: World) -> None:
     client = world.script()
     run = client.post("/api/v1/runs", json={"sequences": ["sheet"]}).json()
@@ -232,11 +212,11 @@ def test_orders_that_make_no_sense_are_refused(world: World) -> None:
         own.start("towel_fold", [], overwrite=True)
 
 
-def test_a_network_of_the_data_folder_is_chosen_and_its_code_only_runs_if_trusted(
+def test_a_click_finds_masks_and_tracks_by_a_network_whose_code_only_runs_if_trusted(
     world: World,
 ) -> None:
-    client = world.script()
-    folder = world.settings.model_dir
+    client, folder = world.script(), world.settings.model_dir
+    assert client.get(ADDRESS).json()["state"] == "none"
     assert client.get("/api/v1/models").json() == {"models": []}
     assert "put the folder of each" in world.browser().get("/sequences/disc/check").text
     folder.mkdir()
@@ -250,6 +230,7 @@ def test_a_network_of_the_data_folder_is_chosen_and_its_code_only_runs_if_truste
     masker = {"name": "masker", "finds": "masks", "kind": "sam2"}
     assert client.get("/api/v1/models").json() == {"models": [tracker, masker]}
     page = world.browser().get("/sequences/disc/check").text
+    assert ('id="annotation"' in page, "Replace those that are there" in page) == (True, False)
     assert '<option value="follower">follower (cotracker3)</option>' in page
     assert '<option value="masker">masker (sam2)</option>' in page
 
@@ -267,7 +248,12 @@ def test_a_network_of_the_data_folder_is_chosen_and_its_code_only_runs_if_truste
     assert answer.status_code == 202, answer.text
     job = until(lambda: (j := client.get(ADDRESS).json())["state"] != "running" and j)
     assert (job["state"], job["reason"]) == ("done", "")
+    assert job["progress"]["stage"] == "point_tracking"
     assert int((folder / "follower/ran.txt").read_text()) != os.getpid()
-    provenance = Sequence.load(world.settings.sequence_dir / "disc").provenance
-    assert provenance["tracks"]["source"] == "cotracker3"
-    assert provenance["masks"]["source"] == "built-in"
+    found = Sequence.load(world.settings.sequence_dir / "disc")
+    assert found.missing("mask", "track") == []
+    sources = {part: found.provenance[part]["source"] for part in ("masks", "tracks")}
+    assert sources == {"masks": "built-in", "tracks": "cotracker3"}
+    assert found.provenance["masks"]["clicks"] == clicks
+    assert "Replace those that are there" in world.browser().get("/sequences/disc/check").text
+    assert client.delete(ADDRESS).status_code == 204

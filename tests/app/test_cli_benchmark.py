@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 
 from app import cli
+from app.benchmarks import latency
 from physhandi.benchmarks import timing
+from physhandi.run import Run
 
 BESIDE = {"nodes", "springs", "substeps", "ms_per_frame", "frames_per_s", "baseline_ms_per_frame",
           "speedup", "max_abs_difference_m"}  # fmt: skip
@@ -67,9 +69,17 @@ def test_a_run_is_simulated_with_fewer_substeps(
     assert result["worst_frame_mean_difference_m"] < 1e-3 < result["motion_m"]
 
 
-def test_a_slider_of_a_run_is_timed(fitted: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_slider_of_a_run_is_timed(
+    fitted: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measured_latency(run: Run, sequence: str, *, device: str) -> dict[str, Any]:
+        asked = {"run": run.id, "sequence": sequence, "device": device}
+        return {"benchmark": "live", "first_new_frame_ms": 8.5, **asked}
+
+    monkeypatch.setattr(latency, "measure_latency", measured_latency)
     result = measured(capsys, "live", fitted)
-    assert 0.0 < result["first_new_frame_ms"] <= result["worst_first_new_frame_ms"]
+    assert (result["run"], result["sequence"]) == ("fitted", "sheet")
+    assert result["first_new_frame_ms"] == 8.5
     code, _, error = call(capsys, "live", fitted, "--sequence", "other", "--device", "cpu")
     assert (code, "has no sequence 'other', but sheet" in error) == (2, True)
 

@@ -70,7 +70,7 @@ def answers(terminal: Terminal, *order: object) -> str:
 @QUICK
 @given(data=st.data(), value=ANYTHING)
 def test_any_value_in_any_place_of_sequence_yaml(
-    gate: Terminal, filmed: Path, data: st.DataObject, value: Any
+    filmed: Path, data: st.DataObject, value: Any
 ) -> None:
     path = filmed / "sequence.yaml"
     original = path.read_text()
@@ -82,10 +82,11 @@ def test_any_value_in_any_place_of_sequence_yaml(
     inner[place[-1]] = value
     try:
         path.write_text(yaml.safe_dump(content))
-        line = answers(gate, "reconstruct", filmed, "--out", "out")
+        Sequence.load(filmed).validate(reads_color=False)
+    except SequenceError as error:
+        assert "'filmed'" in str(error)  # noqa: PT017 - whether it raises depends on the value
     finally:
         path.write_text(original)
-    assert line == "physhandi: passed" or "'filmed'" in line
 
 
 @QUICK
@@ -99,15 +100,13 @@ def test_any_value_in_any_place_of_sequence_yaml(
 @example(text=b"[" * 700)
 @example(text=b"a: &a\n  b: *a\n")
 @given(text=st.one_of(st.binary(max_size=80), st.text(max_size=80).map(str.encode)))
-def test_any_text_as_a_description(gate: Terminal, filmed: Path, text: bytes) -> None:
-    for folder in (filmed, gate.folder / "run"):
-        folder.mkdir(exist_ok=True)
-        for file in ("sequence.yaml", "run.yaml", "job.yaml"):
-            (folder / file).write_bytes(text)
-    assert "'filmed'" in answers(gate, "reconstruct", filmed, "--out", "out")
-    assert "run" in answers(gate, "simulate", gate.folder / "run", "--out", "out")
-    with pytest.raises(RunError):
-        Run.open(gate.folder / "run")
+def test_any_text_as_a_description(filmed: Path, text: bytes) -> None:
+    for file in ("sequence.yaml", "run.yaml", "job.yaml"):
+        (filmed / file).write_bytes(text)
+    with pytest.raises(SequenceError, match="'filmed'"):
+        Sequence.load(filmed)
+    with pytest.raises(RunError, match="filmed"):
+        Run.open(filmed)
 
 
 @pytest.mark.filterwarnings("ignore:Reading .* required additional header parsing")

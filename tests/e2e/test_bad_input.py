@@ -4,9 +4,8 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
-from bad_input_world import fields, put, truncated
+from bad_input_world import fields, truncated
 from playwright.sync_api import Browser, Page, expect
 from scene_page import TIMEOUT_MS
 from sheet_sequence import write_sheet
@@ -19,10 +18,8 @@ ROLLOUT = "sequences/towel_fold/rollout.npy"
 @pytest.fixture
 def page(browser: Browser, served) -> Iterator[Page]:
     """A tab beside damaged recordings and a damaged run; nothing in it may fail by itself."""
-    for name in ("unreadable", "lost"):
-        write_sheet(served.data_dir / "sequences" / name)
+    write_sheet(served.data_dir / "sequences/unreadable")
     fields(colour="red")(served.data_dir / "sequences/unreadable")
-    put("control.npy", (4, 1, 2), np.nan)(served.data_dir / "sequences/lost")
     torn = served.data_dir / "runs/torn"
     shutil.copytree(BUNDLED_RUN, torn)
     truncated(f"attempts/1/out/{ROLLOUT}")(torn)
@@ -47,17 +44,6 @@ def test_what_is_broken_is_told_where_the_user_meets_it(page: Page, served) -> N
     page.locator("#runs [data-run=torn] [data-open]").click()
     expect(page.locator("#toast")).to_contain_text(f"{ROLLOUT} has 60 bytes instead of")
     expect(page.locator("h1")).to_be_visible()
-
-    # A fit of wrong values fails with its reason, and with what to do.
-    page.locator("article[data-sequence=lost]").get_by_role("button", name="Launch fit").click()
-    page.locator("#launch").get_by_role("button", name="Launch", exact=True).click()
-    row = page.locator("#runs tr", has_text="lost")
-    expect(row.locator(".state")).to_have_text("failed")
-    row.get_by_role("link", name="lost").click()
-    failure = page.locator(".failure")
-    expect(failure).to_contain_text("control.npy is nan at frame 4, control 1")
-    expect(failure.locator(".advice")).to_contain_text("Repair the named file of the sequence")
-    assert "Traceback" not in page.locator("body").inner_text()
 
     # An address of nothing is a page with a way home.
     for path in ("/runs/nothing", "/runs/..%2f..%2fetc", "/live/nothing", "/sequences/x/thumbnail"):
