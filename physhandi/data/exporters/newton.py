@@ -41,7 +41,6 @@ import newton
 import numpy as np
 import warp as wp
 
-
 def build(folder=Path(__file__).parent):
     """Make the model: nodes, then control nodes, which have no mass, so that no force moves them.
 
@@ -51,16 +50,19 @@ def build(folder=Path(__file__).parent):
     builder = newton.ModelBuilder(gravity=tuple(parts["gravity"].tolist()))
     names = ("particle_q", "particle_qd", "particle_mass", "particle_radius")
     builder.add_particles(*(parts[name].tolist() for name in names))
-    names = ("spring_indices", "spring_stiffness", "spring_damping")
-    for (i, j), stiffness, damping in zip(*(parts[name].tolist() for name in names)):
-        builder.add_spring(i, j, stiffness, damping, 0.0)
-    builder.spring_rest_length = parts["spring_rest_length"].tolist()
-    if "ground_height" not in parts:
-        return builder.finalize(), None
-    height = float(parts["ground_height"])
-    material = {name: float(parts["ground_" + name]) for name in ("ke", "kd", "kf", "mu")}
-    builder.add_ground_plane(height=height, cfg=newton.ModelBuilder.ShapeConfig(**material))
+    material = {}
+    if "ground_height" in parts:
+        height = float(parts["ground_height"])
+        material = {name: float(parts["ground_" + name]) for name in ("ke", "kd", "kf", "mu")}
+        builder.add_ground_plane(height=height, cfg=newton.ModelBuilder.ShapeConfig(**material))
     model = builder.finalize()
+    # Not by the builder, which would compile what finds the springs at each node for other solvers.
+    model.spring_count = len(parts["spring_rest_length"])
+    model.spring_indices = wp.array(parts["spring_indices"].ravel(), dtype=wp.int32)
+    for name in ("spring_rest_length", "spring_stiffness", "spring_damping"):
+        setattr(model, name, wp.array(parts[name], dtype=wp.float32))
+    if not material:
+        return model, None
     for name, value in material.items():
         setattr(model, "soft_contact_" + name, value)
     count = int(np.sum(parts["particle_mass"] > 0))
