@@ -1,36 +1,44 @@
 """Writes small ROS bags of the made-up scene, as drivers publish it."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from raw_capture import picture
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.camera import PinholeCamera
 
-ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 TREE = "tf2_msgs/msg/TFMessage"
-ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TREE))
 BEGIN = 1_700_000_000_000_000_000
+
+
+@cache
+def store_of(ros: int) -> Any:
+    """The messages of a kind of ROS; rosbags is imported where a bag is written."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    if ros == 1:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TREE))
+    return store
 
 
 class Recorder:
     """Messages of one bag, of either kind of ROS."""
 
     def __init__(self, path: Path, *, ros: int = 1, storage: str = "sqlite3") -> None:
-        self.store = ROS1 if ros == 1 else ROS2
+        from rosbags import rosbag1, rosbag2
+
+        self.store = store_of(ros)
         self.ros = ros
         if ros == 1:
-            self.writer: Any = Writer1(path)
+            self.writer: Any = rosbag1.Writer(path)
         else:
-            plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-            self.writer = Writer2(path, version=9, storage_plugin=plugin)
+            plugin = getattr(rosbag2.StoragePlugin, storage.upper())
+            self.writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
         self.connections: dict[str, Any] = {}
 
     def __enter__(self) -> "Recorder":

@@ -6,7 +6,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.stats import bootstrap
 
 from physhandi.metrics.suite_report import (
     PAIRED_COLUMNS,
@@ -28,6 +27,8 @@ def score(method: str, case: str, value: float, metric: str = "track_error") -> 
 
 
 def test_the_interval_is_that_of_scipy() -> None:
+    from scipy.stats import bootstrap  # Half a second, which processes without this test spare.
+
     value = np.random.default_rng(3).gamma(2.0, 5.0, 12)
     low, high = interval(value, 20_000)
     other = bootstrap(

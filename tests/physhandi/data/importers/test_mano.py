@@ -64,7 +64,7 @@ def _scaled(name: str, factor: float) -> np.ndarray:
     return mano_arrays("right")[name] * factor
 
 
-FAULTS = {
+FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "shapedirs missing": ({"shapedirs": None}, r"the field 'shapedirs' is missing"),
     "too few shapes": (
         {"shapedirs": np.zeros((778, 3, 9))},
@@ -73,14 +73,26 @@ FAULTS = {
     "SMPL": ({"v_template": np.zeros((6890, 3))}, r"'v_template' is float64 of shape \(6890, 3\)"),
     "list": ({"weights": [[1.0] * 16] * 778}, "'weights' is no array"),
     "text": ({"hands_mean": np.array(["a"] * 45)}, "'hands_mean' is <U1"),
-    "NaN": ({"posedirs": _with("posedirs", (5, 2, 7), np.nan)}, r"'posedirs' .* at \[5, 2, 7\]"),
-    "infinite": ({"weights": _with("weights", (0, 3), np.inf)}, r"'weights' .* at \[0, 3\]"),
-    "millimetres": ({"v_template": _scaled("v_template", 1000.0)}, "m long; MANO is in metres"),
-    "weights": ({"weights": _scaled("weights", 0.5)}, "'weights' sums to"),
-    "regressor": ({"J_regressor": _scaled("J_regressor", 2.0)}, "'J_regressor' sums to"),
-    "faces": ({"f": _with("f", (3, 1), 778)}, "'f' has vertices from 0 to 778; there are 778"),
+    "NaN": (
+        {"posedirs": lambda: _with("posedirs", (5, 2, 7), np.nan)},
+        r"'posedirs' .* at \[5, 2, 7\]",
+    ),
+    "infinite": (
+        {"weights": lambda: _with("weights", (0, 3), np.inf)},
+        r"'weights' .* at \[0, 3\]",
+    ),
+    "millimetres": (
+        {"v_template": lambda: _scaled("v_template", 1000.0)},
+        "m long; MANO is in metres",
+    ),
+    "weights": ({"weights": lambda: _scaled("weights", 0.5)}, "'weights' sums to"),
+    "regressor": ({"J_regressor": lambda: _scaled("J_regressor", 2.0)}, "'J_regressor' sums to"),
+    "faces": (
+        {"f": lambda: _with("f", (3, 1), 778)},
+        "'f' has vertices from 0 to 778; there are 778",
+    ),
     "tree": (
-        {"kintree_table": _with("kintree_table", (0, 5), 9)},
+        {"kintree_table": lambda: _with("kintree_table", (0, 5), 9)},
         "'kintree_table' joins .* MANO joins",
     ),
     "style": ({"bs_type": "other"}, "'bs_type' is 'other'"),
@@ -94,7 +106,8 @@ FAULTS = {
 @pytest.mark.parametrize("fault", sorted(FAULTS))
 def test_faults_are_named_and_nothing_is_written(tmp_path: Path, fault: str) -> None:
     changes, named = FAULTS[fault]
-    source = write_mano(tmp_path, **changes)
+    made = {name: value() if callable(value) else value for name, value in changes.items()}
+    source = write_mano(tmp_path, **made)
     with pytest.raises(ImportFailedError, match=named) as caught:
         import_mano(source, tmp_path / "hands")
     assert str(source) in str(caught.value)
