@@ -27,6 +27,7 @@ from physhandi.fitting.hand_reconstruction import (
     _guess_from_one_view,
     _mirrored,
     _told_from_mirrored,
+    _without_jumps,
     depth_target,
     observed_keypoints,
     reconstruct_hands,
@@ -133,6 +134,13 @@ def test_without_masks_a_hand_is_measured_at_its_keypoints(tmp_path: Path) -> No
         assert torch.cdist(point, true).min(dim=1).values.max() < 0.015
     unseen = np.full_like(keypoint[:, :, 0], np.nan)
     assert depth_target(blank, "right", 64, unseen) is None
+
+
+def test_a_turn_by_more_than_half_a_circle_goes_on_without_a_jump() -> None:
+    turned = np.outer(np.linspace(2.8, 3.6, 9), [0.6, 0.0, 0.8])
+    vector = Rotation.from_rotvec(turned).as_rotvec()
+    assert np.abs(np.diff(vector, axis=0)).max() > 3.0
+    np.testing.assert_allclose(_without_jumps(vector), turned, atol=1e-9)
 
 
 def test_depth_tells_a_pose_from_its_mirror_image(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_hands_are_found_from_keypoints_and_are_never_the_object(held_disc):
 
 
 def test_the_object_is_not_the_fingers_behind_it(tmp_path):
-    sequence, true = write_disc(tmp_path / "over", hand=True, frames=5, top=ABOVE_HAND)
+    sequence, true = write_disc(tmp_path / "over", hand=True, top=ABOVE_HAND)
     found = segment(sequence, [Click(*disc_click(top=ABOVE_HAND))])
     for view, label in found.items():
         assert ((label > 1) & (true[view] == 1)).sum() < 0.02 * (true[view] == 1).sum()

@@ -77,6 +77,15 @@ def test_views_are_joined_along_those_that_share_most() -> None:
     assert report["a, b"]["places"] == 200  # A hundred in each of two frames.
 
 
+def test_pairs_of_places_that_fit_alone_lay_nothing() -> None:
+    """Two places are as far apart as in the other view, and no third one fits them."""
+    fixed = part(places(4), slice(0, 4))
+    point = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.15], [-0.1, 0.3]])
+    elsewhere = np.array([[0.0, 0.0], [0.2, 0.0], [-0.4, 0.4], [0.6, -0.5]])
+    moving = TablePattern(elsewhere, fixed.descriptor)
+    assert lay_patterns([moving], [TablePattern(point, fixed.descriptor)]) is None
+
+
 def test_what_cannot_be_trusted_is_refused() -> None:
     world = places(120)
     other = moved(world, 0.5, (0.2, 0.1))
