@@ -303,12 +303,18 @@ def test_a_held_simulation_goes_on_frame_by_frame_and_gives_the_same_motion(
     np.testing.assert_array_equal(frames(seen), run.array("sequences/lift/rollout.npy"))
 
 
-def test_a_killed_process_comes_back_held(live, mailbox, run) -> None:
-    live.hold("a", on=True)
+def test_a_killed_process_comes_back_held_and_finishes_the_work(live, mailbox, run) -> None:
+    live.hold("a", on=True)  # So that it is not done before it is killed.
     live.request("a", ask(run))
     mailbox.until("frame")
-    os.kill(live.process_id, signal.SIGKILL)
-    assert mailbox.until("frame")[-1]["frame"] == 0
+    process = live.process_id
+    assert process is not None
+    os.kill(process, signal.SIGKILL)
+    messages = mailbox.until("frame")
+    crashed = next(m for m in messages if m.kind == "crashed")
+    assert (crashed["code"], crashed["is_retried"]) == (-signal.SIGKILL, True)
+    assert live.process_id not in {None, process}
+    assert messages[-1]["frame"] == 0
     finish_another(live, run)
     assert mailbox.messages.empty()
     live.hold("a", on=False)
@@ -332,21 +338,6 @@ def test_the_fewest_stable_substeps_are_told(live, mailbox, run) -> None:
 def test_a_request_that_makes_no_sense_is_answered(live, mailbox, run) -> None:
     live.request("a", replace(ask(run), sequence="nowhere"))
     assert "nowhere" in mailbox.until("failed")[-1]["error"]
-
-
-def test_a_killed_process_comes_back_and_finishes_the_work(live, mailbox, run) -> None:
-    live.hold("a", on=True)  # So that it is not done before it is killed.
-    live.request("a", ask(run))
-    mailbox.until("frame")
-    process = live.process_id
-    assert process is not None
-    os.kill(process, signal.SIGKILL)
-    messages = mailbox.until("frame")
-    live.hold("a", on=False)
-    messages += mailbox.until("finished")
-    crashed = next(m for m in messages if m.kind == "crashed")
-    assert (crashed["code"], crashed["is_retried"]) == (-signal.SIGKILL, True)
-    assert live.process_id not in {None, process}
 
 
 def test_the_process_dies_with_its_parent() -> None:
