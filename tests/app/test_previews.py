@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -134,74 +135,67 @@ def until_ready(previews: Previews, kind: str, name: str) -> None:
     until(lambda: previews.look(kind, name).state != "pending")
 
 
-def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -> None:
-    kept = world.settings.preview_dir
-    sheet = world.settings.sequence_dir / "sheet"
-    (world.settings.sequence_dir / "empty").mkdir()
-    about = yaml.safe_load((sheet / "sequence.yaml").read_text()) | {"name": "empty"}
-    (world.settings.sequence_dir / "empty" / "sequence.yaml").write_text(yaml.safe_dump(about))
+@contextmanager
+def drawn(world: World, *shown: tuple[str, str]) -> Iterator[Previews]:
+    """Have the pictures of some drawn, all by one process."""
     previews = Previews(world.settings, world.catalog)
-    assert previews.look("sequence", "sheet").state == "pending"
-    assert previews.file("sequence", "sheet", is_moving=True) is None
-    assert previews.look("sequence", "empty").state == "pending"
-    before = sorted(world.settings.run_dir.rglob("*"))
+    for kind, name in shown:
+        assert previews.look(kind, name).state == "pending"
     previews.start()
     try:
-        until_ready(previews, "sequence", "sheet")
-        until_ready(previews, "sequence", "empty")
-        assert previews.look("sequence", "empty").state == "none"
-        picture = previews.look("sequence", "sheet")
-        assert picture.still.startswith("sequences/sheet/still?v=")
-        path = previews.file("sequence", "sheet", is_moving=True)
-        assert path is not None
-        with Image.open(path) as moving:
-            assert (moving.size, moving.n_frames) == ((WIDTH, HEIGHT), 10)
-            frames = [
-                np.asarray(f.convert("RGBA"), dtype=int) for f in ImageSequence.Iterator(moving)
-            ]
-        assert np.abs(frames[0] - frames[-1]).mean() > 1
-        still = previews.file("sequence", "sheet", is_moving=False)
-        assert still is not None
-        with Image.open(still) as image:
-            assert image.size == (WIDTH, HEIGHT)
-        # A changed sequence has a new picture in the place of the old one.
-        os.utime(sheet / "sequence.yaml", ns=(1, 1))
-        assert previews.look("sequence", "sheet").state == "pending"
-        until_ready(previews, "sequence", "sheet")
-        until(lambda: len(list(kept.glob("sequence-sheet-*.moving.webp"))) == 1)
-        shutil.rmtree(kept)
-        kept.mkdir()
-        assert previews.look("run", "fitted").state == "pending"
-        until_ready(previews, "run", "fitted")
-        assert previews.look("run", "fitted").moving.startswith("runs/fitted/preview?v=")
-        assert sorted(world.settings.run_dir.rglob("*")) == before
+        for kind, name in shown:
+            until_ready(previews, kind, name)
+        yield previews
     finally:
         previews.shutdown()
 
 
-def test_a_preview_of_which_one_picture_was_cleared_away_is_drawn_again(world: World) -> None:
-    shown = (("sequence", "sheet", False), ("run", "fitted", True))
+def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -> None:
+    kept, sequences = world.settings.preview_dir, world.settings.sequence_dir
+    shutil.copytree(sequences / "sheet", sequences / "other")
+    (sequences / "empty").mkdir()
+    about = yaml.safe_load((sequences / "sheet/sequence.yaml").read_text()) | {"name": "empty"}
+    (sequences / "empty/sequence.yaml").write_text(yaml.safe_dump(about))
+    before = sorted(world.settings.run_dir.rglob("*"))
+    sheet, other, fitted = ("sequence", "sheet"), ("sequence", "other"), ("run", "fitted")
+    nothing = Previews(world.settings, world.catalog)
+    assert nothing.file(*sheet, is_moving=True) is None
+    with drawn(world, sheet, ("sequence", "empty"), other, fitted) as previews:
+        assert previews.look("sequence", "empty").state == "none"
+        assert previews.look(*sheet).still.startswith("sequences/sheet/still?v=")
+        files = [
+            previews.file(*of, is_moving=moves)
+            for of, moves in product((sheet, fitted), (False, True))
+        ]
+        old = previews.file(*other, is_moving=True)
+    still, moving, _, moving_run = (path for path in files if path is not None)
+    see_what_is_shown(still, moving)
 
-    def draw() -> None:
-        """Have the pictures of both drawn, by one process."""
-        previews = Previews(world.settings, world.catalog)
-        for kind, name, _ in shown:
-            assert previews.look(kind, name).state == "pending"
-        previews.start()
-        try:
-            for kind, name, _ in shown:
-                until_ready(previews, kind, name)
-        finally:
-            previews.shutdown()
+    # Of which one picture was cleared away both are drawn again, and what has changed.
+    for path in (still, moving_run):
+        path.unlink()
+    os.utime(sequences / "other/sequence.yaml", ns=(1, 1))
+    with drawn(world, sheet, fitted, other) as previews:
+        assert still.is_file()
+        assert moving_run.is_file()
+        until(lambda: len(list(kept.glob("sequence-other-*.moving.webp"))) == 1)
+        assert previews.file(*other, is_moving=True) != old
+        shutil.rmtree(kept)
+        kept.mkdir()
+        assert previews.look(*fitted).state == "pending"
+        until_ready(previews, *fitted)
+        assert previews.look(*fitted).moving.startswith("runs/fitted/preview?v=")
+    assert sorted(world.settings.run_dir.rglob("*")) == before
 
-    draw()
-    kept = Previews(world.settings, world.catalog)
-    cleared = [kept.file(kind, name, is_moving=is_moving) for kind, name, is_moving in shown]
-    for picture in cleared:
-        assert picture is not None
-        picture.unlink()
-    draw()
-    assert all(picture is not None and picture.is_file() for picture in cleared)
+
+def see_what_is_shown(still: Path, moving: Path) -> None:
+    """See that a picture moves, and both have the size of previews."""
+    with Image.open(moving) as image:
+        assert (image.size, image.n_frames) == ((WIDTH, HEIGHT), 10)
+        frames = [np.asarray(f.convert("RGBA"), dtype=int) for f in ImageSequence.Iterator(image)]
+    assert np.abs(frames[0] - frames[-1]).mean() > 1
+    with Image.open(still) as image:
+        assert image.size == (WIDTH, HEIGHT)
 
 
 def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
