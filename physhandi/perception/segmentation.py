@@ -55,6 +55,9 @@ _SHADOWS = (1.0, 0.8, 0.6)
 """Shares of its lightness with which background is seen, the smaller ones in shadows."""
 _SHADED = 0.1
 """Share of the object's pixels that count as seen in a shadow, too: that of a hand falls on it."""
+_LEAST_INNER = 0.3
+"""Share of an object's pixels that must lie off its rim for its colors to be learned from these
+alone: a rim shows some of what is behind it, too."""
 _MEMORY = 6.0
 """Frames' worth of pixels that the colors of a thing are remembered by."""
 _OBJECT_RATE = 0.33
@@ -1141,7 +1144,8 @@ def _begin(
     for value, hand in hands.items():
         seen.things[value].add(patch.code[hand.core])
         seed = seed & ~hand.core
-    if colors.is_known() and seed.any():
+    is_whole = colors.is_known()  # Other views have shown it, and where all of it is.
+    if is_whole and seed.any():
         seed = _own_seed(seen, patch, seed, list(hands))
     has_object = int(seed.sum()) > 0
     _learn_object(colors, shadowed, seed)
@@ -1153,9 +1157,10 @@ def _begin(
             score[0] -= _RAISED * ((farness < 0.5) & (patch.height > 4 * seen.noise))
         label = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
         if has_object:
-            kept = _hanging_together(seen, patch, label, seed) | seed
-            label[(label == OBJECT_LABEL) & ~kept] = _BACKGROUND
-            _learn_object(colors, shadowed, kept)
+            label = _hanging_together(seen, patch, label, seed)
+            kept = (label == OBJECT_LABEL) | seed
+            # From a click, an object of several colors is found by what lies between them.
+            _learn_object(colors, shadowed, _off_rim(kept) if is_whole else kept)
             farness = _farness(seen, patch, kept)
         for value, hand in hands.items():
             seen.things[value].replace(patch.code[hand.core & (label == value)])
@@ -1167,7 +1172,7 @@ def _learn_given(seen: _Seen, image: _Image, label: UInt8[ndarray, "row column"]
     """Learn from a frame whose labels are right how everything looks."""
     patch = _Patch(seen, image, seen.whole)
     shadowed = [_code(patch.lab, share) for share in _SHADOWS]
-    _learn_object(seen.things[OBJECT_LABEL], shadowed, label == OBJECT_LABEL)
+    _learn_object(seen.things[OBJECT_LABEL], shadowed, _off_rim(label == OBJECT_LABEL))
     for value in HAND_LABEL.values():
         seen.things[value].replace(patch.code[label == value])
     _learn_background(seen, patch, shadowed, label)
@@ -1195,6 +1200,12 @@ def _learn_object(
     colors.replace(shadowed[0][mask])
     for code in shadowed[1:]:
         colors.add(code[mask], _SHADED)
+
+
+def _off_rim(mask: Bool[ndarray, "row column"]) -> Bool[ndarray, "row column"]:
+    """Leave out the rim of a mask, unless that is most of it."""
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return inner if inner.sum() > _LEAST_INNER * mask.sum() else mask
 
 
 def _own_seed(
@@ -1234,8 +1245,7 @@ def _advance(
     labels, score = _judge(seen, patch, hands, farness, carried, has_object=has_object)
     inner = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
     if has_object:
-        kept = _hanging_together(seen, patch, inner, anchor)
-        inner[(inner == OBJECT_LABEL) & ~kept] = _BACKGROUND
+        inner = _hanging_together(seen, patch, inner, anchor)
     _learn(seen, patch, labels, score, inner)
     result = np.zeros_like(label)
     result[window] = _outlined(patch, inner)
@@ -1257,7 +1267,8 @@ def _learn(
     for value in labels[1:]:
         rate = _OBJECT_RATE if value == OBJECT_LABEL else _SKIN_RATE
         seen.things[value].fade(_MEMORY * max(50, int((label == value).sum())))
-        of_thing = is_sure & (label == value)
+        mine = label == value
+        of_thing = is_sure & (_off_rim(mine) if value == OBJECT_LABEL else mine)
         seen.things[value].add(patch.code[of_thing], rate)
         if value == OBJECT_LABEL:
             for share in _SHADOWS[1:]:
@@ -1287,8 +1298,12 @@ def _hanging_together(
     patch: _Patch,
     label: UInt8[ndarray, "row column"],
     seed: Bool[ndarray, "row column"],
-) -> Bool[ndarray, "row column"]:
-    """Keep the pieces of the object that hold a seed, or hang on such a piece behind a hand."""
+) -> UInt8[ndarray, "row column"]:
+    """Keep the pieces of the object that hold a seed, or hang on such a piece behind a hand.
+
+    What begins beside a hand and has its colors rather than the object's is the hand's: a wrist
+    that its keypoints do not reach, for instance. Other pieces are background.
+    """
     is_object = label == OBJECT_LABEL
     piece = _pieces(seen, patch, is_object)
     count = int(piece.max()) + 1
@@ -1296,16 +1311,55 @@ def _hanging_together(
     is_kept = np.bincount(piece[is_object & seed], minlength=count) > 0
     kept = is_object & is_kept[piece]
     hand = label > OBJECT_LABEL
+    owner = np.zeros(count, dtype=np.uint8)
     if kept.any() and hand.any():
         depth = patch.depth[hand & patch.has_depth]
         reach = _BRIDGE * seen.focal / float(np.median(depth)) if depth.size else 3.0
-        beside = cv2.dilate(hand.astype(np.uint8), _disc(max(1, round(reach)))) > 0
+        around = _disc(max(1, round(reach)))
+        beside = cv2.dilate(hand.astype(np.uint8), around) > 0
+        owner = _skin_of(seen, patch, label, piece, around)
+        owner[is_kept] = _BACKGROUND
         if (beside & kept).any():
             least = max(_LEAST_PIECE, 0.02 * float(kept.sum()))
             touches = np.bincount(piece[is_object & beside], minlength=count) > 0
-            kept = is_object & (is_kept | (touches & (size >= least)))[piece]
+            is_kept |= touches & (owner == _BACKGROUND) & (size >= least)
+            kept = is_object & is_kept[piece]
     # At depth edges single pixels are pieces of their own.
-    return is_object & (cv2.dilate(kept.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    kept = is_object & (cv2.dilate(kept.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    return np.where(is_object & ~kept, owner[piece], label)
+
+
+def _skin_of(
+    seen: _Seen,
+    patch: _Patch,
+    label: UInt8[ndarray, "row column"],
+    piece: Int[ndarray, "row column"],
+    around: UInt8[ndarray, "row column"],
+) -> UInt8[ndarray, " piece"]:
+    """Tell which pieces of the object are beside a hand and have its colors, not the object's.
+
+    Args:
+        seen: The view.
+        patch: What is judged.
+        label: Labels.
+        piece: Numbers of the object's pieces.
+        around: What is beside a hand's pixel.
+
+    Returns:
+        The hand's label of each piece, 0 of those that are no hand's.
+    """
+    is_object = label == OBJECT_LABEL
+    count = int(piece.max()) + 1
+    owner, most = np.zeros(count, dtype=np.uint8), np.zeros(count)
+    own = seen.things[OBJECT_LABEL].log_density(patch.code[is_object])
+    for value in np.unique(label[label > OBJECT_LABEL]).tolist():
+        lead = seen.things[value].log_density(patch.code[is_object]) - own
+        lead = np.bincount(piece[is_object], weights=lead, minlength=count)
+        beside = cv2.dilate((label == value).astype(np.uint8), around) > 0
+        lead[np.bincount(piece[is_object & beside], minlength=count) == 0] = 0.0
+        owner[lead > most] = value
+        most = np.maximum(most, lead)
+    return owner
 
 
 def _pieces(

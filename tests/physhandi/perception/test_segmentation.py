@@ -3,7 +3,16 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from clicked_disc import ABOVE_HAND, FRAMES, HEIGHT, WIDTH, cameras, disc_click, write_disc
+from clicked_disc import (
+    ABOVE_HAND,
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    cameras,
+    disc_click,
+    joints,
+    write_disc,
+)
 
 from physhandi.errors import CancelledError, MissingInputError, UsageError
 from physhandi.perception import segmentation
@@ -93,6 +102,37 @@ def test_what_one_view_takes_for_a_hand_yields_to_a_view_that_is_surer(tmp_path,
     for view, least in ((unsure, 0.7), (other, 0.8)):
         assert agreement(found[view], true[view], 2).mean() > least
         assert agreement(found[view], true[view], 1).mean() > 0.9
+
+
+def test_a_wrist_that_keypoints_do_not_reach_is_the_hands_not_the_objects(tmp_path):
+    sequence, true = write_disc(tmp_path / "short", hand=True, frames=5)
+    random = np.random.default_rng(0)
+    for view in sequence.views:
+        keypoint = np.load(view.folder / "keypoint.npy")
+        for frame, path in enumerate(view.files("color")):
+            # As a detector that finds a fist: a fifth as long as the hand, at its fingertips.
+            joint = joints(frame)
+            short = joint[12] + 0.2 * (joint - joint[12])
+            keypoint[frame, 0, :, :2] = view.camera.project(short)
+            image, hand = cv2.imread(str(path)).astype(float), true[view.name][frame] == 2
+            image[hand] += random.uniform(-40, 40, (hand.sum(), 3))  # Skin has many colors.
+            cv2.imwrite(str(path), image.clip(0, 255).astype(np.uint8))
+        np.save(view.folder / "keypoint.npy", keypoint)
+    found = segment(type(sequence).load(sequence.folder), [Click(*disc_click())])
+    for view, label in found.items():
+        # Else a quarter of the hand is the object's.
+        assert ((label == 1) & (true[view] == 2)).sum() < 0.01 * (true[view] == 2).sum()
+        assert agreement(label, true[view], 2).mean() > 0.95
+
+
+def test_colors_of_a_blurred_rim_are_not_learned_as_the_objects(tmp_path):
+    sequence, true = write_disc(tmp_path / "blurred", frames=5)
+    for view in sequence.views:
+        for path in view.files("color"):
+            cv2.imwrite(str(path), cv2.GaussianBlur(cv2.imread(str(path)), (0, 0), 1.0))
+    found = segment(type(sequence).load(sequence.folder), [Click(*disc_click())])
+    # 0.957 where they are learned.
+    assert agreement(found["side"], true["side"], 1).mean() > 0.975
 
 
 def test_without_a_click_hands_alone_are_found(held_disc):
