@@ -299,7 +299,7 @@ def test_a_grid_of_april_tags_calibrates_too(tmp_path, numbering):
         image = image[::-1, ::-1] if numbering == "Kalibr" else image
         y, x = 20 + row * 78, 20 + column * 78
         sheet[y : y + 60, x : x + 60] = image
-    cameras = {"left": camera_at(30, 6), "right": camera_at(110, 6)}
+    cameras = {"left": camera_at(30, 4), "right": camera_at(110, 4)}
     raw = RawCapture(tmp_path / "raw", cameras).write(2, poses=False)
     lies = np.diag([1.0, -1.0, -1.0, 1.0])
     lies[:3, 3] = [-0.15, 0.11, 0.0]

@@ -20,7 +20,7 @@ from physhandi.synthetic.raw_capture import (
     write_raw_capture,
 )
 
-CAMERAS = {"camera0": camera_at(20, 4, 0.8), "camera1": camera_at(100, 4, 0.8)}
+CAMERAS = {"camera0": camera_at(20, 3, 0.8), "camera1": camera_at(100, 3, 0.8)}
 
 
 @pytest.fixture(scope="module")
