@@ -28,6 +28,7 @@ from scene_page import (
     TIMEOUT_MS,
     ScenePage,
 )
+from small_pictures import place_pictures
 from waiting import LIMIT_S, until
 
 from app.benchmarks.browser import find_chromium
@@ -111,6 +112,8 @@ def _serving(folder: Path) -> Iterator[Served]:
     # Users start it where they work, and often have a package of this name there.
     (folder / "app").mkdir()
     (folder / "app" / "__init__.py").write_text("raise SystemExit('a package of the user')")
+    if not os.environ.get(_PICTURES):
+        place_pictures(folder / "data")
     options = ["--port", "0", "--data-dir", "data", "--root-path", BELOW]
     options += ["--read-only-token-file", "read_only"]
     command = [sys.executable, "-P", "-c", START, "serve", *options]

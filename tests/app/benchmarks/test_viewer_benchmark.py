@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_WORK
+from small_pictures import place_pictures
 
 from app import cli
 from app.benchmarks import browser, latency, splats, streams, viewer
@@ -48,6 +49,19 @@ def little(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(browser, "_SIZE", (900, 500))
 
 
+@pytest.fixture
+def pictured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let servers find small pictures of what comes with the program, each of which draws them."""
+    make = viewer._Bench._data
+
+    def data(bench: Any, name: str) -> Path:
+        folder = make(bench, name)
+        place_pictures(folder)
+        return folder
+
+    monkeypatch.setattr(viewer._Bench, "_data", data)
+
+
 def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as end:
         cli.main(["benchmark", "viewer", *arguments])
@@ -61,7 +75,7 @@ def is_in_order(times: dict[str, float]) -> bool:
 @pytest.mark.e2e
 @pytest.mark.slow
 def test_clients_with_and_without_a_browser_measure_the_real_server(
-    little: None, capsys: pytest.CaptureFixture[str]
+    little: None, pictured: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parts = ("paint", "open", "scrub", "slider", "browser", "bytes", "runs")
     code, out, error = call(capsys, "--quick", "--json", "--parts", *parts)
