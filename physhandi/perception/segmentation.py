@@ -58,6 +58,9 @@ _SHADED = 0.1
 _LEAST_INNER = 0.3
 """Share of an object's pixels that must lie off its rim for its colors to be learned from these
 alone: a rim shows some of what is behind it, too."""
+_WIDEST_PIXEL = 0.0025
+"""Width of a pixel on the object up to which that is done [m]; a wider rim holds all that a thing
+shows of its shaded sides."""
 _MEMORY = 6.0
 """Frames' worth of pixels that the colors of a thing are remembered by."""
 _OBJECT_RATE = 0.33
@@ -1160,7 +1163,7 @@ def _begin(
             label = _hanging_together(seen, patch, label, seed)
             kept = (label == OBJECT_LABEL) | seed
             # From a click, an object of several colors is found by what lies between them.
-            _learn_object(colors, shadowed, _off_rim(kept) if is_whole else kept)
+            _learn_object(colors, shadowed, _off_rim(seen, patch, kept) if is_whole else kept)
             farness = _farness(seen, patch, kept)
         for value, hand in hands.items():
             seen.things[value].replace(patch.code[hand.core & (label == value)])
@@ -1172,7 +1175,8 @@ def _learn_given(seen: _Seen, image: _Image, label: UInt8[ndarray, "row column"]
     """Learn from a frame whose labels are right how everything looks."""
     patch = _Patch(seen, image, seen.whole)
     shadowed = [_code(patch.lab, share) for share in _SHADOWS]
-    _learn_object(seen.things[OBJECT_LABEL], shadowed, _off_rim(label == OBJECT_LABEL))
+    inner = _off_rim(seen, patch, label == OBJECT_LABEL)
+    _learn_object(seen.things[OBJECT_LABEL], shadowed, inner)
     for value in HAND_LABEL.values():
         seen.things[value].replace(patch.code[label == value])
     _learn_background(seen, patch, shadowed, label)
@@ -1202,8 +1206,13 @@ def _learn_object(
         colors.add(code[mask], _SHADED)
 
 
-def _off_rim(mask: Bool[ndarray, "row column"]) -> Bool[ndarray, "row column"]:
-    """Leave out the rim of a mask, unless that is most of it."""
+def _off_rim(
+    seen: _Seen, patch: _Patch, mask: Bool[ndarray, "row column"]
+) -> Bool[ndarray, "row column"]:
+    """Leave out the rim of the object, unless that is most of it or shows much of its surface."""
+    depth = patch.depth[mask & patch.has_depth]
+    if not depth.size or float(np.median(depth)) > _WIDEST_PIXEL * seen.focal:
+        return mask
     inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return inner if inner.sum() > _LEAST_INNER * mask.sum() else mask
 
@@ -1268,7 +1277,7 @@ def _learn(
         rate = _OBJECT_RATE if value == OBJECT_LABEL else _SKIN_RATE
         seen.things[value].fade(_MEMORY * max(50, int((label == value).sum())))
         mine = label == value
-        of_thing = is_sure & (_off_rim(mine) if value == OBJECT_LABEL else mine)
+        of_thing = is_sure & (_off_rim(seen, patch, mine) if value == OBJECT_LABEL else mine)
         seen.things[value].add(patch.code[of_thing], rate)
         if value == OBJECT_LABEL:
             for share in _SHADOWS[1:]:
