@@ -561,27 +561,31 @@ def _problems(
     sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt
 ) -> list[ObjectProblem]:
     rest_node = artefacts.load_array(attempt.out / REST_NODE_FILE)
+    follows_contact = config.object_.contact_over_time and not bends_as_rod(sequences, config)
+    kind, thickness = None, 0.0
+    if config.object_.rests_where_seen or follows_contact:
+        kind, thickness = artefacts.load_shape(attempt.out)
     clearance = None
     problems = []
     for sequence in sequences:
         files = SequenceFiles(sequence.name)
         object_node = artefacts.load_array(attempt.out / files.object_node)
-        if clearance is None and config.object_.rests_where_seen:
+        if clearance is None and kind is not None and config.object_.rests_where_seen:
             # It is the object's, which the first sequence defines.
-            kind, thickness = artefacts.load_shape(attempt.out)
             clearance = resting_clearance(
                 object_node, sequence.ground_height, kind, thickness=thickness
             )
         observation = _followed(attempt, sequence, object_node, config.object_)
         control = artefacts.load_control(attempt.out, sequence.name)
         contacts = None
-        if config.object_.contact_over_time and not bends_as_rod(sequences, config):
+        if follows_contact:
             contacts = find_contacts(
                 observation,
                 object_node,
                 control,
                 frame_count=len(sequence.reconstruction_frames),
                 frame_rate=sequence.frame_rate,
+                kind=kind,
                 most_grips=config.object_.most_grips,
             )
         problems.append(

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from physhandi.data.observation import ObjectObservation
+from physhandi.data.sequence_meta import ShapeClass
 from physhandi.fitting.rest_state import node_distance
 from physhandi.fitting.search_bounds import neighbor_distance
 from physhandi.metrics.baselines import last_residual, placed_tracks
@@ -28,6 +29,12 @@ from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 NEAR_HAND, LONGEST_HOLD = 1.5, 4.0
 """Distances from the hand within which a node can be held, and of the longest spring that can be
 laid to it then. In distances of nodes, or of control nodes where these are farther apart."""
+NEAR_HAND_SOLID, BEHIND_NEAREST = 1.0, 0.5
+"""Distance from the hand within which a node of a solid can be held, and how much farther away than
+the nearest node it can be, if that is more; both at most `NEAR_HAND`. Nodes of a solid lie on the
+surface that fingers touch, and where these press it in, what is around moves along without being
+held. Those of ropes and sheets lie on the side that is seen, and fingers hold them from the other
+one."""
 COARSEST_HAND = 3.0
 """Most that distances of control nodes count, in distances of nodes."""
 SLIP = 1.0
@@ -84,6 +91,7 @@ def find_contacts(
     *,
     frame_count: int,
     frame_rate: float,
+    kind: ShapeClass | None = None,
     most_grips: int | None = None,
 ) -> ContactIntervals:
     """Find what hands hold, and when, in the frames that are fitted.
@@ -94,6 +102,7 @@ def find_contacts(
         control: Control nodes in all frames, also those to predict [m].
         frame_count: Frames to fit; nothing but the control nodes is read of later ones.
         frame_rate: Frames a second [Hz].
+        kind: Kind of the object; None if it is not known.
         most_grips: Most control nodes, the nearest ones, that hold a node at a time; None for all.
 
     Returns:
@@ -118,17 +127,18 @@ def find_contacts(
     near = [KDTree(hand).query(nodes) for hand, nodes in zip(hands.control, seen, strict=True)]
     distance, nearest = (np.array(values) for values in zip(*near, strict=True))
     reach = np.clip(neighbor_distance(hands.control[0]), spacing, COARSEST_HAND * spacing)
+    near_hand = _near_hand(distance, reach, kind)
     shortest = max(2, round(SHORTEST * frame_rate))
     window = 2 * round(SMOOTHING * frame_rate / 2) + 1
     # What nothing shows stays beside the hand where it was seen last.
     distance = np.take_along_axis(distance, last_told, axis=0)
     nearest = np.take_along_axis(nearest, last_told, axis=0)
     held: list[tuple[int, int, int]] = []
-    for index in np.flatnonzero((distance < NEAR_HAND * reach).any(axis=0)):
+    for index in np.flatnonzero((distance < near_hand[:, None]).any(axis=0)):
         candidate, which = np.unique(nearest[:, index], return_inverse=True)
         local = hands.seen_from(seen[:, index], candidate)[:, last_told[:, index]]
         local = median_filter(local, size=(1, window, 1), mode="nearest")
-        is_near = distance[:, index] < NEAR_HAND * reach
+        is_near = distance[:, index] < near_hand
         tolerance = SLIP * spacing + GIVE * distance[:, index]
         held += [
             (int(index), *contact)
@@ -160,6 +170,17 @@ def find_contacts(
         rank=rank[kept].astype(np.int32),
         interval=interval[kept].astype(np.int32),
     )
+
+
+def _near_hand(
+    distance: Float[ndarray, "frame node"], reach: float, kind: ShapeClass | None
+) -> Float[ndarray, " frame"]:
+    """Compute within which distance from the hands nodes can be held [m], in each frame."""
+    farthest = np.full(len(distance), NEAR_HAND * reach)
+    if kind != "solid":
+        return farthest
+    behind_nearest = distance.min(axis=1) + BEHIND_NEAREST * reach
+    return np.clip(behind_nearest, NEAR_HAND_SOLID * reach, farthest)
 
 
 def observed_nodes(

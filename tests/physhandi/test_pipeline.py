@@ -17,6 +17,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
+from physhandi.fitting.contact_detection import find_contacts
 from physhandi.progress import Progress
 from physhandi.run import Run
 from physhandi.simulation.contact_intervals import NEVER
@@ -162,8 +163,15 @@ def simulate(folder: Path, source: Run, sequence: Path, **changes: float) -> Run
 
 
 def test_contacts_over_time_are_stored_and_kept_with_other_radii(
-    tmp_path: Path, recordings: Path
+    tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    kinds: list[str] = []
+
+    def find(*observed: Any, **options: Any) -> Any:
+        kinds.append(options["kind"])
+        return find_contacts(*observed, **options)
+
+    monkeypatch.setattr(pipeline, "find_contacts", find)
     late = tmp_path / "late"
     shutil.copytree(recordings / "low", late)
     control = np.load(late / "control.npy")
@@ -173,6 +181,7 @@ def test_contacts_over_time_are_stored_and_kept_with_other_radii(
     config = config.replace(object_=config.object_.replace(contact_over_time=True))
     run = new_run(tmp_path / "fit", [late], config.to_dict())
     pipeline.run_job(run)
+    assert set(kinds) == {"sheet"}
     run = Run.open(run.folder)
     object_ = run.object_in("low")
     contacts, model = object_.contacts, object_.model

@@ -68,6 +68,23 @@ def test_what_is_held_from_the_start_is_held_for_ever() -> None:
     assert contacts.node[of_one][order][0] == MIDDLE
 
 
+@pytest.mark.parametrize(("gap", "limit"), [(0.3, 1.0), (0.8, 1.3), (1.2, 1.5)])
+def test_less_of_a_solid_is_held_unless_its_hand_was_found_away_from_it(
+    gap: float, limit: float
+) -> None:
+    place = SHEET[MIDDLE] + [0.0, 0.0, gap * SPACING]
+    way = along(0, ramp(5, 35, 0.06))
+    near = np.linalg.norm(SHEET[:, None] - (place + PALM)[None], axis=2).min(axis=1)
+    for kind, farthest in (("solid", limit), ("sheet", 1.5), (None, 1.5)):
+        contacts = find_contacts(
+            seen(way), SHEET, hand(place + way), frame_count=FRAMES, frame_rate=RATE, kind=kind
+        )
+        held = np.flatnonzero(near < farthest * SPACING)
+        np.testing.assert_array_equal(np.unique(contacts.node), held)
+    # Which the limits tell apart: 25 of all objects, 21 of a solid that is touched.
+    assert {0.3: 4, 0.8: 4, 1.2: 0}[gap] == ((near >= limit * SPACING) & (near < 0.015)).sum()
+
+
 def test_a_late_hand_holds_once_it_has_come_to_rest() -> None:
     coming = along(2, 0.03 - ramp(2, 12, 0.03))
     way = along(1, ramp(20, 38, 0.04))
