@@ -41,6 +41,7 @@ import newton
 import numpy as np
 import warp as wp
 
+
 def build(folder=Path(__file__).parent):
     """Make the model: nodes, then control nodes, which have no mass, so that no force moves them.
 
