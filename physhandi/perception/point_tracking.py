@@ -29,9 +29,10 @@ from physhandi.progress import NullProgress, Progress
 
 _cv2: Any = cv2  # Its type stubs refuse absent starts.
 TRACKING_STAGE = "point_tracking"
-MOST_TRACKS = 300
-"""Tracks that begin in a view's first frame, if there is room."""
-LEAST_TRACKS = 180
+MOST_TRACKS = 400
+"""Tracks of a view in a frame in which some begin, if there is room: where much is lost from frame
+to frame, more than half of them end before they are old enough to be kept."""
+LEAST_TRACKS = 220
 """Living tracks below which new ones begin, if there is room."""
 
 _WINDOW = (9, 21)

@@ -11,7 +11,7 @@ from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError
 from physhandi.perception import point_tracking
-from physhandi.perception.point_tracking import LEAST_TRACKS, track_points
+from physhandi.perception.point_tracking import track_points
 from physhandi.progress import Progress
 
 
@@ -249,5 +249,17 @@ def test_tracking_can_be_cancelled(disc):
         track_points(*disc, Impatient())
 
 
-def test_the_goal_of_150_tracks_is_below_what_starts_new_ones():
-    assert LEAST_TRACKS > 150
+def test_150_tracks_are_kept_where_more_than_half_end_in_every_frame(tmp_path, monkeypatch):
+    sequence, labels = write_strip(tmp_path / "table", (0.0, 0.0))
+    spotted = np.zeros_like(labels["top"])
+    spotted[:, 4:60, 4:124] = 1
+    follow, luck = point_tracking._follow, np.random.default_rng(0)
+
+    def losing(before, now, start, size, guess=None, **options):
+        end, is_found = follow(before, now, start, size, guess, **options)
+        return end, is_found & (luck.random(len(end)) < 0.48) if guess is None else is_found
+
+    monkeypatch.setattr(point_tracking, "_follow", losing)
+    _, is_seen = track_points(sequence, {"top": spotted})["top"]
+    # The first two frames have no older tracks, and in the last two none begins that is kept.
+    assert is_seen[2:-2].sum(axis=1).min() >= 150
