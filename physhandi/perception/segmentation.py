@@ -1321,16 +1321,14 @@ def _hanging_together(
     kept = is_object & is_kept[piece]
     hand = label > OBJECT_LABEL
     owner = np.zeros(count, dtype=np.uint8)
-    if kept.any() and hand.any():
+    if is_kept.any() and hand.any():
         depth = patch.depth[hand & patch.has_depth]
         reach = _BRIDGE * seen.focal / float(np.median(depth)) if depth.size else 3.0
-        around = _disc(max(1, round(reach)))
-        beside = cv2.dilate(hand.astype(np.uint8), around) > 0
-        owner = _skin_of(seen, patch, label, piece, around)
-        owner[is_kept] = _BACKGROUND
-        if (beside & kept).any():
+        touches, owner = _beside_hands(
+            seen, patch, label, piece, is_kept=is_kept, reach=max(1, round(reach))
+        )
+        if touches[is_kept].any():
             least = max(_LEAST_PIECE, 0.02 * float(kept.sum()))
-            touches = np.bincount(piece[is_object & beside], minlength=count) > 0
             is_kept |= touches & (owner == _BACKGROUND) & (size >= least)
             kept = is_object & is_kept[piece]
     # At depth edges single pixels are pieces of their own.
@@ -1338,37 +1336,43 @@ def _hanging_together(
     return np.where(is_object & ~kept, owner[piece], label)
 
 
-def _skin_of(
+def _beside_hands(
     seen: _Seen,
     patch: _Patch,
     label: UInt8[ndarray, "row column"],
     piece: Int[ndarray, "row column"],
-    around: UInt8[ndarray, "row column"],
-) -> UInt8[ndarray, " piece"]:
-    """Tell which pieces of the object are beside a hand and have its colors, not the object's.
+    *,
+    is_kept: Bool[ndarray, " piece"],
+    reach: int,
+) -> tuple[Bool[ndarray, " piece"], UInt8[ndarray, " piece"]]:
+    """Tell which pieces of the object are beside a hand, and which of these are its skin.
 
     Args:
         seen: The view.
         patch: What is judged.
         label: Labels.
         piece: Numbers of the object's pieces.
-        around: What is beside a hand's pixel.
+        is_kept: Pieces that are the object's.
+        reach: What is beside a hand is at most so far from it [px].
 
     Returns:
-        The hand's label of each piece, 0 of those that are no hand's.
+        Whether each piece is beside a hand; and the label of the hand whose colors it has rather
+        than the object's, 0 of those that are the object's or no hand's.
     """
     is_object = label == OBJECT_LABEL
-    count = int(piece.max()) + 1
-    owner, most = np.zeros(count, dtype=np.uint8), np.zeros(count)
-    own = seen.things[OBJECT_LABEL].log_density(patch.code[is_object])
+    is_asked = is_object & ~is_kept[piece]
+    count = len(is_kept)
+    touches, owner, most = np.zeros(count, bool), np.zeros(count, np.uint8), np.zeros(count)
+    own = seen.things[OBJECT_LABEL].log_density(patch.code[is_asked])
     for value in np.unique(label[label > OBJECT_LABEL]).tolist():
-        lead = seen.things[value].log_density(patch.code[is_object]) - own
-        lead = np.bincount(piece[is_object], weights=lead, minlength=count)
-        beside = cv2.dilate((label == value).astype(np.uint8), around) > 0
-        lead[np.bincount(piece[is_object & beside], minlength=count) == 0] = 0.0
-        owner[lead > most] = value
-        most = np.maximum(most, lead)
-    return owner
+        beside = cv2.dilate((label == value).astype(np.uint8), _disc(reach)) > 0
+        is_beside = np.bincount(piece[is_object & beside], minlength=count) > 0
+        touches |= is_beside
+        lead = seen.things[value].log_density(patch.code[is_asked]) - own
+        lead = np.bincount(piece[is_asked], weights=lead, minlength=count)
+        owner[is_beside & (lead > most)] = value
+        most = np.where(is_beside, np.maximum(most, lead), most)
+    return touches, owner
 
 
 def _pieces(
