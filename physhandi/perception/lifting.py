@@ -1,5 +1,6 @@
 """Lifts depth, masks and tracks of all views into the world and fuses them."""
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
@@ -24,7 +25,9 @@ OUTLIER_COUNT = 6
 """Voxels, its own included, that must be occupied within `OUTLIER_RADIUS` of a point."""
 
 _RING = tuple((row, column) for row in range(3) for column in range(3) if (row, column) != (1, 1))
-_SOLID_NEIGHBORS = 5
+_SOLID_NEIGHBORS, _THIN_NEIGHBORS = 5, 3
+_THIN = 4.0
+"""Thickness up to which most pixels of a thing are at its edges [px]."""
 
 
 def observe_object(sequence: Sequence, progress: Progress | None = None) -> ObjectObservation:
@@ -121,7 +124,8 @@ def surface_points(
     """Lift the labelled pixels of one depth image, without mixed pixels at depth edges.
 
     A pixel counts if at least five of the eight around it have the same label and a depth within
-    `EDGE_STEP`; a sensor's mixed pixels between foreground and background have fewer.
+    `EDGE_STEP`; a sensor's mixed pixels between foreground and background have fewer. So have most
+    pixels of a rope that is two or three pixels wide and above the table: three are enough there.
 
     Args:
         view: View that recorded the image.
@@ -140,9 +144,16 @@ def surface_points(
         near = padded_depth[row : row + height, column : column + width]
         company = padded_good[row : row + height, column : column + width]
         companions += company & (np.abs(near - depth) < EDGE_STEP)
-    rows, columns = np.nonzero(good & (companions >= _SOLID_NEIGHBORS))
+    enough = _THIN_NEIGHBORS if mask_thickness(is_labelled) <= _THIN else _SOLID_NEIGHBORS
+    rows, columns = np.nonzero(good & (companions >= enough))
     pixel = np.stack([columns, rows], axis=1).astype(np.float64)
     return view.camera.unproject(pixel, depth[rows, columns].astype(np.float64))
+
+
+def mask_thickness(is_labelled: Bool[ndarray, "row column"]) -> float:
+    """Tell how thick what is labelled is in most places [px]; 0 if nothing is."""
+    inside = cv2.distanceTransform(is_labelled.astype(np.uint8), cv2.DIST_L2, 3)
+    return 2 * float(np.percentile(inside[is_labelled], 90)) if is_labelled.any() else 0.0
 
 
 def fuse(parts: list[Float[ndarray, "_ 3"]]) -> Float[ndarray, "point 3"]:

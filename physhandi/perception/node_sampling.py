@@ -21,7 +21,7 @@ from scipy.ndimage import binary_closing, binary_fill_holes
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, KDTree, QhullError
 
-from physhandi.perception.object_points import WIDEST_GAP
+from physhandi.perception.object_points import WIDEST_GAP, WIDEST_HIDDEN_GAP
 from physhandi.perception.shape_class import (
     STANDING_HEIGHT,
     HiddenTest,
@@ -51,6 +51,8 @@ _AROUND = 7
 """Nodes about which a filling is drawn smooth, itself included."""
 _DRAWN = 20
 """Times that it is."""
+_UPRIGHT = 0.95
+"""Sine of the steepest slope of a tube that has an upper half."""
 _TOUCHING = 1.6
 """Distance up to which nodes on a surface are beside each other, in distances between nodes."""
 
@@ -238,18 +240,26 @@ def _filling(
 
 
 def rope_nodes(
-    cloud: Float[ndarray, "point 3"], spacing: float, is_hidden: HiddenTest | None
+    cloud: Float[ndarray, "point 3"],
+    spacing: float,
+    thickness: float,
+    is_hidden: HiddenTest | None,
 ) -> Float[ndarray, "node 3"]:
     """Sample nodes evenly along the seen side of a rope, and join its pieces straight.
+
+    What joins them has the rope's thickness, as the rest has: springs along a line do not resist
+    bending, and it is where hands hold a rope that it is hidden.
 
     Args:
         cloud: Points on the rope [m].
         spacing: Distance between neighbouring nodes [m].
+        thickness: Diameter of the rope [m].
         is_hidden: Where the rope may continue unseen.
     """
     node = poisson_disk_points(cloud, _PACKING * spacing)
     piece = connected_components(links(node, _TOUCHING * spacing), directed=False)[1]
-    pair, across, length = _gaps(node, np.arange(len(node)), spacing, WIDEST_GAP)
+    widest = WIDEST_GAP if is_hidden is None else WIDEST_HIDDEN_GAP
+    pair, across, length = _gaps(node, np.arange(len(node)), spacing, widest)
     bridges, owner = _bridges(node, pair, across, length, spacing)
     is_open = np.ones(len(pair), dtype=bool)
     if is_hidden is not None and len(bridges):
@@ -259,8 +269,45 @@ def rope_nodes(
         first, second = piece[pair[index]]
         if first != second:
             piece[piece == second] = first
-            added.append(bridges[owner == index])
+            bridge = bridges[owner == index]
+            lines = int(0.5 * np.pi * thickness / (_PACKING * spacing)) + 1
+            if lines > 2 and length[index] > thickness:
+                bridge = _half_tube(node, node[pair[index]], len(bridge), thickness, lines)
+            added.append(bridge)
     return np.concatenate(added)
+
+
+def _half_tube(
+    node: Float[ndarray, "node 3"],
+    end: Float[ndarray, "2 3"],
+    count: int,
+    thickness: float,
+    lines: int,
+) -> Float[ndarray, "filling 3"]:
+    """Lay the upper half of a straight tube from one end of a gap in a rope to the other.
+
+    Args:
+        node: Nodes on the rope [m].
+        end: Those at both ends of the gap [m].
+        count: Number of nodes along the tube.
+        thickness: Its diameter [m].
+        lines: Number of nodes around it.
+    """
+    axis = (end[1] - end[0]) / np.linalg.norm(end[1] - end[0])
+    upward = np.eye(3)[0 if abs(axis[2]) > _UPRIGHT else 2]
+    upward = upward - (upward @ axis) * axis
+    upward /= np.linalg.norm(upward)
+    sideways = np.cross(axis, upward)
+
+    def top_near(place: Float[ndarray, " 3"]) -> Float[ndarray, " 3"]:
+        around = node[np.linalg.norm(node - place, axis=1) < thickness] - place
+        return place + (around @ sideways).mean() * sideways + (around @ upward).max() * upward
+
+    first, last = (top_near(place) for place in end)
+    share = np.linspace(0.0, 1.0, count + 2)[1:-1, None, None]
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, lines)[:, None]
+    around = (np.cos(angle) - 1.0) * upward + np.sin(angle) * sideways
+    return ((1.0 - share) * first + share * last + 0.5 * thickness * around).reshape(-1, 3)
 
 
 def _gaps(

@@ -7,11 +7,12 @@ depth sensors invent points at edges. What goes, in this order:
    stands in between, unless they are within half a cell of what all views allow.
 2. *Loose* pieces. Points that are nearer to each other than two cells hang together. The largest
    piece is the object. Another one is real if it has at least `LEAST_PIECE` of the largest one's
-   points and is at most `WIDEST_GAP` away from a real one; so much a hand may hide.
+   points and is at most `WIDEST_GAP` away from a real one; so much a hand may hide. Along a hand it
+   may be more, up to `WIDEST_HIDDEN_GAP`, if no view sees past the object anywhere on the way.
 3. *Stray* points: far from their own nearest neighbors, as measured by the median over the cloud.
 """
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,12 +25,15 @@ from scipy.spatial import KDTree
 
 from physhandi.data.view import View
 from physhandi.perception.lifting import OBJECT_LABEL
-from physhandi.perception.shape_class import links
+from physhandi.perception.shape_class import HiddenTest, links
 
 LEAST_PIECE = 0.03
 """Points of a real piece, as a share of those of the largest one."""
 WIDEST_GAP = 0.15
 """Widest gap between two real pieces [m]: a hand with its thumb spread."""
+WIDEST_HIDDEN_GAP = 0.25
+"""The same where no view sees past the object on the straight way across [m]: a hand along which
+it lies, and the wrist."""
 CALIBRATION_MARGIN = 4
 """Pixels by which masks and cameras may be wrong."""
 _NEARER = 0.02
@@ -67,7 +71,7 @@ def object_points(
     cloud: Float[ndarray, "point 3"],
     cell: float,
     *,
-    is_possible: Callable[[Float[ndarray, "point 3"]], Bool[ndarray, " point"]] | None = None,
+    is_possible: HiddenTest | None = None,
 ) -> tuple[Bool[ndarray, " point"], tuple[Removal, ...]]:
     """Tell which points of a cloud are the object.
 
@@ -89,7 +93,7 @@ def object_points(
             is_kept = KDTree(cloud[is_allowed]).query(cloud)[0] <= 0.5 * cell
             steps.append(("background", ~is_kept))
     before = is_kept.copy()
-    is_kept[before] = _is_in_real_piece(cloud[before], cell)
+    is_kept[before] = _is_in_real_piece(cloud[before], cell, is_possible)
     steps.append(("loose", before & ~is_kept))
     before = is_kept.copy()
     is_kept[before] = ~_is_stray(cloud[before], cell)
@@ -143,7 +147,19 @@ def silhouette_test(
     return possible
 
 
-def _is_in_real_piece(cloud: Float[ndarray, "point 3"], cell: float) -> Bool[ndarray, " point"]:
+def _is_in_real_piece(
+    cloud: Float[ndarray, "point 3"], cell: float, is_possible: HiddenTest | None
+) -> Bool[ndarray, " point"]:
+    def is_near(piece: Float[ndarray, "point 3"], tree: KDTree) -> bool:
+        distance, nearest = tree.query(piece)
+        first = int(distance.argmin())
+        if distance[first] <= WIDEST_GAP:
+            return True
+        if is_possible is None or distance[first] > WIDEST_HIDDEN_GAP:
+            return False
+        count = math.ceil(distance[first] / (0.5 * cell))
+        return bool(is_possible(np.linspace(piece[first], tree.data[nearest[first]], count)).all())
+
     label = connected_components(links(cloud, 2.0 * cell), directed=False)[1]
     count = np.bincount(label)
     # Of pieces of one size, the one whose first point comes first in space is the largest.
@@ -154,7 +170,7 @@ def _is_in_real_piece(cloud: Float[ndarray, "point 3"], cell: float) -> Bool[nda
     is_kept = label == largest
     while waiting:
         tree = KDTree(cloud[is_kept])
-        near = {n for n in waiting if tree.query(cloud[label == n])[0].min() <= WIDEST_GAP}
+        near = {n for n in waiting if is_near(cloud[label == n], tree)}
         if not near:
             break
         is_kept |= np.isin(label, list(near))

@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
-from physhandi.perception.lifting import OBJECT_LABEL
+from physhandi.perception.lifting import OBJECT_LABEL, mask_thickness
 from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
@@ -147,7 +147,7 @@ class _Tracker:
         gray = cv2.cvtColor(self._view.color(frame), cv2.COLOR_RGB2GRAY)
         is_object = self._mask[frame] == OBJECT_LABEL
         depth = _solid_depth(self._view.depth(frame), is_object)
-        if 0 < _thickness(is_object) <= _THIN:
+        if 0 < mask_thickness(is_object) <= _THIN:
             self._own[frame] = _own_pixels(gray, is_object)
         self._gray[frame] = gray
         if self._alive:
@@ -339,13 +339,7 @@ def _at(image: ndarray, pixel: Float[ndarray, "track 2"]) -> ndarray:
 
 def _window_size(is_object: Bool[ndarray, "row column"]) -> int:
     """Choose what is matched as wide as the object is thick, so that little else gets into it."""
-    return int(np.clip(round(_thickness(is_object)), *_WINDOW)) | 1
-
-
-def _thickness(is_object: Bool[ndarray, "row column"]) -> float:
-    """Tell how thick the object is in most places [px]; 0 if it is not seen."""
-    inside = cv2.distanceTransform(is_object.astype(np.uint8), cv2.DIST_L2, 3)
-    return 2 * float(np.percentile(inside[is_object], 90)) if is_object.any() else 0.0
+    return int(np.clip(round(mask_thickness(is_object)), *_WINDOW)) | 1
 
 
 def _own_pixels(

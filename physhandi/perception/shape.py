@@ -237,13 +237,22 @@ def object_shape(
     if samples is not None and mesh is not None and is_closed(mesh[1]):
         found = _with_mesh(found, samples, spacing)
     kind_used = kind or found.kind
+    thickness = found.thickness
     if ground_height is not None and kind_used in {"solid", "rope"}:
-        thickness = min(found.thickness, float(np.percentile(seen[:, 2], 80)) - ground_height)
+        thickness = min(thickness, float(np.percentile(seen[:, 2], 80)) - ground_height)
         is_ground = _is_ground(seen, cell_size(seen, spacing), ground_height, thickness)
         if is_ground.any():
             removed = (*removed, removal("ground", seen, is_ground, ~is_ground))
             seen = seen[~is_ground]
-    node = _nodes(kind_used, seen, spacing, ground_height, is_hidden=is_hidden, mesh=samples)
+    node = _nodes(
+        kind_used,
+        seen,
+        spacing,
+        ground_height,
+        thickness=thickness,
+        is_hidden=is_hidden,
+        mesh=samples,
+    )
     if ground_height is not None:
         node[:, 2] = np.maximum(node[:, 2], ground_height)
     return ObjectShape(
@@ -264,6 +273,7 @@ def _nodes(
     spacing: float,
     ground_height: float | None,
     *,
+    thickness: float,
     is_hidden: HiddenTest | None,
     mesh: SurfaceSamples | None,
 ) -> Float[ndarray, "node 3"]:
@@ -273,7 +283,7 @@ def _nodes(
             return meshed_solid_nodes(seen, spacing, ground_height, mesh)
         return solid_nodes(seen, spacing, ground_height)
     if kind == "rope":
-        node = rope_nodes(seen, spacing, is_hidden)
+        node = rope_nodes(seen, spacing, thickness, is_hidden)
     elif kind == "sheet" and is_flat(seen, spacing):
         node = flat_sheet_nodes(seen, spacing, is_hidden)
     else:

@@ -89,6 +89,23 @@ def test_mixed_pixels_at_an_edge_are_not_lifted(plate):
     assert np.abs(points[:, 2]).max() < 1e-6
 
 
+def test_a_rope_of_two_pixels_above_a_table_is_lifted_without_the_table(plate):
+    view = plate.views[0]
+    rows, columns = np.indices(view.depth(0).shape)
+    # Upwards by one pixel every two: no pixel has more than four beside it that show the rope.
+    above_line = rows - 40 - columns // 2
+    is_inside = (columns >= 20) & (columns < 80)
+    rope = is_inside & (above_line >= 0) & (above_line < 2)
+    label = is_inside & (above_line >= 0) & (above_line < 3)
+    depth = np.where(rope, 0.5, 0.6).astype(np.float32)
+    depth[rope & (columns == 50)] = 0.55
+    points = surface_points(view, depth, label)
+    found = view.camera.camera_depth(points)
+    assert 0.9 * rope.sum() < (abs(found - 0.5) < 1e-6).sum() <= rope.sum() - 2
+    assert not ((found > 0.51) & (found < 0.59)).any()
+    assert (found > 0.59).sum() < 0.2 * rope.sum()
+
+
 def test_fuse_averages_a_voxel_and_drops_lonely_points():
     grid = np.stack(np.meshgrid(np.arange(10), np.arange(10), [0.0]), -1).reshape(-1, 3) * 0.0045
     grid += 0.0022

@@ -213,6 +213,49 @@ def test_a_rope_behind_a_hand_stays_in_one_piece():
     assert (open_.kind, connected_components(graph, directed=False)[0]) == ("rope", 2)
 
 
+def test_a_hidden_part_of_a_rope_is_as_thick_as_the_rest():
+    length, hidden = np.arange(-0.3, 0.3, 0.002)[:, None], (-0.05, 0.05)
+    around = np.linspace(0, np.pi, 12)[None]
+    y, z = np.broadcast_arrays(0.006 * np.cos(around), 0.006 + 0.006 * np.sin(around))
+    rope = np.stack(np.broadcast_arrays(length, y, z), axis=-1).reshape(-1, 3)
+    ends = made.noisy(rope[(rope[:, 0] < hidden[0]) | (rope[:, 0] > hidden[1])])
+    node = object_shape(ends, SPACING, ground_height=0.0, kind="rope").node
+    filled = node[(node[:, 0] > hidden[0] + 0.01) & (node[:, 0] < hidden[1] - 0.01)]
+    # Three lines: the top of the half tube, and its sides at half of the rope's height.
+    assert 3 * 7 <= len(filled) <= 3 * 10
+    sides = np.sort(filled[:, 1])[:: len(filled) // 3][:3]
+    np.testing.assert_allclose(np.diff(sides), 0.006, atol=0.002)
+    top = filled[:, 2] > 0.009
+    assert 2 * top.sum() == (~top).sum()
+    np.testing.assert_allclose(filled[top, 2], 0.012, atol=0.002)
+    np.testing.assert_allclose(filled[~top, 2], 0.006, atol=0.002)
+    # Of a rope that is thin beside the distance of nodes, a line.
+    coarse = object_shape(ends, 0.02, ground_height=0.0, kind="rope").node
+    assert (np.abs(coarse[np.abs(coarse[:, 0]) < 0.03, 1]) < 0.008).all()
+
+
+def test_ends_of_a_rope_far_apart_are_joined_where_no_view_sees_between_them():
+    length = np.arange(-0.3, 0.3, 0.002)
+    rope = made.noisy(np.stack([length, 0 * length, 0.3 + 0 * length], axis=1))
+
+    def shape_with(gap: float, seen_at: float | None):
+        def is_hidden(point: np.ndarray) -> np.ndarray:
+            is_past = np.zeros(len(point), bool) if seen_at is None else point[:, 0] > seen_at
+            is_past &= point[:, 0] < (seen_at or 0) + 0.02
+            return ~is_past
+
+        ends = rope[np.abs(rope[:, 0]) > 0.5 * gap]
+        return object_shape(ends, SPACING, is_hidden=is_hidden, is_possible=is_hidden, kind="rope")
+
+    joined = shape_with(0.2, None)
+    assert joined.removed == ()
+    assert connected_components(links(joined.node.astype(float), 1.6 * SPACING))[0] == 1
+    for gap, seen_at in ((0.2, 0.03), (0.27, None)):
+        (loose,) = shape_with(gap, seen_at).removed
+        assert loose.reason == "loose"
+        assert loose.distance == pytest.approx(0.5 * gap + 0.3, abs=0.01)
+
+
 def test_what_views_see_below_makes_a_dome_a_sheet():
     cloud = made.noisy(made.ellipsoid((0.10, 0.07, 0.05), 0.0, lowest=0.0))
     assert object_shape(cloud, SPACING, ground_height=0.0).kind == "solid"
