@@ -14,20 +14,20 @@ PIP_FLAGS := --quiet --disable-pip-version-check --no-compile -c constraints.txt
 install: $(STAMP)
 
 # A newer pip than a fresh environment has needs half the time. It leaves compiling to the first
-# import: of all modules that are installed few are used. One pip keeps one processor busy, so two
-# install what the second part of constraints.txt names, each its own packages; the last looks for
-# what these have left out.
+# import: of all modules that are installed few are used. One pip keeps less than one processor busy,
+# so five install what the second part of constraints.txt names, each its own packages; the last
+# looks for what these have left out.
 export PYTHONDONTWRITEBYTECODE :=
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_FLAGS) --upgrade pip
 	sed '1,/^# What else/d; /^# Other/,$$d' constraints.txt >$(VENV)/packages
-	awk 'NR % 3 == 0' $(VENV)/packages >$(VENV)/packages.first
-	awk 'NR % 3 != 0' $(VENV)/packages >$(VENV)/packages.second
-	{ $(BIN)/python -m pip install $(PIP_FLAGS) $(TORCH) && \
-	  $(BIN)/python -m pip install $(PIP_FLAGS) --no-deps -r $(VENV)/packages.first; } & first=$$!; \
-	$(BIN)/python -m pip install $(PIP_FLAGS) --no-deps -r $(VENV)/packages.second; second=$$?; \
-	wait $$first && exit $$second
+	for part in 0 1 2 3; do awk "NR % 4 == $$part" $(VENV)/packages >$(VENV)/packages.$$part; done
+	processes=; \
+	for packages in $(TORCH) "--no-deps -r $(VENV)/packages.0" "--no-deps -r $(VENV)/packages.1" \
+	  "--no-deps -r $(VENV)/packages.2" "--no-deps -r $(VENV)/packages.3"; do \
+	  $(BIN)/python -m pip install $(PIP_FLAGS) $$packages & processes="$$processes $$!"; done; \
+	for process in $$processes; do wait $$process || exit; done
 	$(BIN)/python -m pip install $(PIP_FLAGS) -e ".[dev,synth,capture,models,newton,usd]"
 	touch $@
 
