@@ -282,14 +282,15 @@ def arrange_entries(
     """
     group = wp.tid()
     tile = group // wp.static(TILE // PHASE)
+    phase, kinds = int(PHASE), int(2)  # Not constants: the loops would be unrolled 16 times.
     for column in range(tile_end[tile]):
         used = int(0)
-        for turn in range(wp.static(PHASE)):
+        for turn in range(phase):
             place = (turn + column) % wp.static(PHASE)
             row = group * wp.static(PHASE) + place
             best = int(-1)
             most = int(0)
-            for kind in range(2):
+            for kind in range(kinds):
                 if best < 0:
                     for bank in range(wp.static(PHASE)):
                         here = (2 * row + kind) * wp.static(PHASE) + bank
