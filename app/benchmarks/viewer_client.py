@@ -1,7 +1,9 @@
 """A client of a live scene without a browser: speaks viser's wire format over a websocket."""
 
+import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Self, cast
 
 import msgspec.msgpack
@@ -9,6 +11,7 @@ import numpy as np
 import viser
 import zstandard
 from numpy import ndarray
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 PROTOCOL = f"viser-v{viser.__version__}"
@@ -89,7 +92,16 @@ class ViewerClient:
         return self
 
     def __exit__(self, *_: object) -> None:
+        # Of a connection whose messages nobody takes, the answer to its closing is not read either.
+        reader = threading.Thread(target=self._drop_messages)
+        reader.start()
         self.connection.close()
+        reader.join()
+
+    def _drop_messages(self) -> None:
+        with suppress(ConnectionClosed):
+            while True:
+                self.connection.recv()
 
     def send(self, kind: str, **fields: Any) -> None:
         """Send one message of viser's."""
