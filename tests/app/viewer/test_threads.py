@@ -276,7 +276,8 @@ def test_a_parameter_to_be_put_back_is_not_forgotten_before_it_is_heard(
         assert session._object is not None
         panel = session._object.panel
         client.set("drag [1/s]", 9.0)
-        client.until(lambda: "drag [1/s]" in panel._changed)
+        # The last that is written of a change: what offers it has been set back by then.
+        client.until(lambda: "drag" in panel._changes.content)
         # As viser keeps what a user has chosen, before it is told to anybody.
         panel._put_back.handle._impl.value = "drag [1/s]"
         panel._show_changes()
