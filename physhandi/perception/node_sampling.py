@@ -260,17 +260,19 @@ def rope_nodes(
     piece = connected_components(links(node, _TOUCHING * spacing), directed=False)[1]
     widest = WIDEST_GAP if is_hidden is None else WIDEST_HIDDEN_GAP
     pair, across, length = _gaps(node, np.arange(len(node)), spacing, widest)
+    is_between = piece[pair[:, 0]] != piece[pair[:, 1]]
+    pair, across, length = (part[is_between] for part in (pair, across, length))
     bridges, owner = _bridges(node, pair, across, length, spacing)
     is_open = np.ones(len(pair), dtype=bool)
     if is_hidden is not None and len(bridges):
         np.logical_and.at(is_open, owner, is_hidden(bridges))
+    lines = int(0.5 * np.pi * thickness / (_PACKING * spacing)) + 1
     added = [node]
     for index in np.flatnonzero(is_open)[np.argsort(length[is_open], kind="stable")]:
         first, second = piece[pair[index]]
         if first != second:
             piece[piece == second] = first
             bridge = bridges[owner == index]
-            lines = int(0.5 * np.pi * thickness / (_PACKING * spacing)) + 1
             if lines > 2 and length[index] > thickness:
                 bridge = _half_tube(node, node[pair[index]], len(bridge), thickness, lines)
             added.append(bridge)

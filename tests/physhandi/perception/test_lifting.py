@@ -92,7 +92,7 @@ def test_mixed_pixels_at_an_edge_are_not_lifted(plate):
 def test_a_rope_of_two_pixels_above_a_table_is_lifted_without_the_table(plate):
     view = plate.views[0]
     rows, columns = np.indices(view.depth(0).shape)
-    # Upwards by one pixel every two: no pixel has more than four beside it that show the rope.
+    # One row further every two columns: half of its pixels have four beside them that show it.
     above_line = rows - 40 - columns // 2
     is_inside = (columns >= 20) & (columns < 80)
     rope = is_inside & (above_line >= 0) & (above_line < 2)
