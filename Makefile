@@ -15,8 +15,8 @@ install: $(STAMP)
 
 # A newer pip than a fresh environment has needs half the time. It leaves compiling to the first
 # import: of all modules that are installed few are used. One pip keeps less than one processor busy,
-# so five install what the second part of constraints.txt names, each its own packages; the last
-# looks for what these have left out.
+# so six install what the second part of constraints.txt names, each its own packages, and the project
+# itself, which is built meanwhile; the last looks for what these have left out.
 export PYTHONDONTWRITEBYTECODE :=
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -25,10 +25,10 @@ $(STAMP): pyproject.toml constraints.txt
 	for part in 0 1 2 3; do awk "NR % 4 == $$part" $(VENV)/packages >$(VENV)/packages.$$part; done
 	processes=; \
 	for packages in $(TORCH) "--no-deps -r $(VENV)/packages.0" "--no-deps -r $(VENV)/packages.1" \
-	  "--no-deps -r $(VENV)/packages.2" "--no-deps -r $(VENV)/packages.3"; do \
+	  "--no-deps -r $(VENV)/packages.2" "--no-deps -r $(VENV)/packages.3" "--no-deps -e ."; do \
 	  $(BIN)/python -m pip install $(PIP_FLAGS) $$packages & processes="$$processes $$!"; done; \
 	for process in $$processes; do wait $$process || exit; done
-	$(BIN)/python -m pip install $(PIP_FLAGS) -e ".[dev,synth,capture,models,newton,usd]"
+	$(BIN)/python -m pip install $(PIP_FLAGS) "physhandi[dev,synth,capture,models,newton,usd]"
 	touch $@
 
 demo: install
