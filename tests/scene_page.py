@@ -25,9 +25,9 @@ FEWER_PICTURES = """{
     for (const draw of due) {
       try { draw(performance.now()); } catch (error) { reportError(error); }
     }
-  }, 300);
+  }, 500);
 }"""
-"""Three pictures a second in the place of sixty: tests wait for what is in them, not for how many.
+"""Two pictures a second in the place of sixty: tests wait for what is in them, not for how many.
 
 Software draws them, which is much of what these tests cost. A page that is resting draws none.
 `physhandi benchmark viewer` measures how many pictures a browser gets."""
