@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 
 from app.cli.lookup import find_sequence, folder_of_sequence, open_catalog
 from app.cli.output import AsJson, DataDir, Device, show
+from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import PhysHandiError, RunError, UsageError
@@ -193,7 +194,13 @@ def annotate(
             track_model=track_model,
             trusts_model_code=trust_model_code,
         )
-    show({"sequence": str(done.folder), "masks": _found(done)})
+    show({"sequence": str(done.folder), "masks": _found(done), **_method(done)})
+
+
+def _method(sequence: Sequence) -> dict[str, Any]:
+    """Tell how points of a thin object were followed."""
+    about = named_fields(sequence.provenance.get("tracks")) or {}
+    return {"tracks": about["method"]} if "method" in about else {}
 
 
 def _found(sequence: Sequence) -> dict[str, Any]:
@@ -520,6 +527,7 @@ def import_capture(
             "frames": sequence.frame_count,
             "frame_rate": sequence.frame_rate,
             "masks": _found(sequence) if clicks else None,
+            **_method(sequence),
             **{name: sequence.provenance[name] for name in told if sequence.provenance[name]},
         }
     )

@@ -26,16 +26,20 @@ from physhandi.data.files import (
 )
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
+from physhandi.data.view import View
 from physhandi.errors import SequenceError, UsageError
 from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
 from physhandi.perception.mask_model import MaskModel
-from physhandi.perception.point_tracking import track_points, visible_on_object
+from physhandi.perception.point_tracking import PixelTracks, track_points, visible_on_object
 from physhandi.perception.segmentation import Click, carry_on, segment
+from physhandi.perception.thin_tracking import is_thin, thin_tracks
 from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
 BUILT_IN = "built-in"
 """What provenance calls masks and tracks that were made here."""
+LENGTHS_ALONG = "lengths along it from its ends"
+"""What it says of tracks of a thin object, as of a rope."""
 _HASH = "model_sha256"
 """What it says of those that a model of the user made here."""
 _FILES = ("mask", "track.npy", "track_visible.npy")
@@ -95,7 +99,7 @@ def annotate(
             )
         finder = None if mask_model is None else MaskModel(mask_model)
         masks = segment(sequence, clicks, progress, finder)
-        tracks = track_points(sequence, masks, progress, tracker) if clicks else {}
+        tracks, method = _follow(sequence, masks, progress, tracker) if clicks else ({}, {})
         about = {
             part: {
                 **({"source": BUILT_IN} if model is None else model.provenance()),
@@ -108,7 +112,7 @@ def annotate(
     provenance: dict[str, Any] = {**sequence.provenance, "masks": about["masks"]}
     provenance.pop("tracks", None)
     if tracks:
-        provenance["tracks"] = about["tracks"]
+        provenance["tracks"] = {**about["tracks"], **method}
     return _store(sequence, masks, tracks, provenance)
 
 
@@ -153,11 +157,7 @@ def correct_masks(
     for one in corrections:
         _check_correction(sequence, one)
         right.setdefault(one.view, []).append(one.frame)
-    masks = {
-        view.name: np.stack([view.mask(frame) for frame in range(view.frame_count)])
-        for view in sequence.views
-        if view.name in right
-    }
+    masks = {view.name: _stored_masks(view) for view in sequence.views if view.name in right}
     for one in corrections:
         masks[one.view][one.frame] = one.label
     about = named_fields(sequence.provenance.get("masks")) or {"source": "unknown"}
@@ -173,7 +173,8 @@ def correct_masks(
     tracks: dict[str, tuple[ndarray, ndarray]] = {}
     of_tracks = named_fields(sequence.provenance.get("tracks")) or {}
     if of_tracks.get("source") == BUILT_IN:
-        tracks = track_points(sequence, masks, progress)
+        tracks, method = _follow(sequence, masks, progress)
+        of_tracks = {key: value for key, value in of_tracks.items() if key != "method"} | method
     else:
         for view in sequence.views:
             if view.track is not None and view.track_visible is not None:
@@ -186,7 +187,38 @@ def correct_masks(
     done = {(entry["view"], entry["frame"]) for entry in new}
     kept = [e for e in known if (e.get("view"), e.get("frame")) not in done]
     provenance = {**sequence.provenance, "masks": {**about, "corrections": [*kept, *new]}}
+    if of_tracks:
+        provenance["tracks"] = of_tracks
     return _store(sequence, masks, tracks, provenance)
+
+
+def _stored_masks(view: View) -> UInt8[ndarray, "frame row column"]:
+    return np.stack([view.mask(frame) for frame in range(view.frame_count)])
+
+
+def _follow(
+    sequence: Sequence,
+    masks: Mapping[str, UInt8[ndarray, "frame row column"]],
+    progress: Progress,
+    tracker: TrackModel | None = None,
+) -> tuple[PixelTracks, dict[str, str]]:
+    """Follow points of the object, and tell provenance how, where what is built in has a choice.
+
+    Lengths along a thin object need masks of all views; those that are not given are as stored.
+    """
+    views = [view for view in sequence.views if view.has_color and view.has_depth]
+    method: dict[str, str] = {}
+    if tracker is None:
+        seen = {view.name: masks[view.name] for view in views if view.name in masks}
+        if is_thin(seen):
+            views = [view for view in views if view.name in masks or view.has_mask]
+            seen |= {view.name: _stored_masks(view) for view in views if view.name not in masks}
+        if is_thin(seen):
+            tracks, trouble = thin_tracks(views, seen, sequence.frame_rate, progress)
+            if tracks:
+                return tracks, {"method": LENGTHS_ALONG}
+            method = {"method": f"optical flow, since {trouble}"}
+    return track_points(sequence, masks, progress, tracker), method
 
 
 def _check_correction(sequence: Sequence, one: Correction) -> None:

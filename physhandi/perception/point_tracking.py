@@ -12,6 +12,7 @@ hangs on a shadow, say), or that a hand covers, ends; new ones begin where the o
 them. A track model, where the user has one, follows the points in the place of that.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,6 +28,9 @@ from physhandi.perception.lifting import OBJECT_LABEL, mask_thickness
 from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
+PixelTracks = dict[str, tuple[Float[ndarray, "frame _ 2"], Bool[ndarray, "frame _"]]]
+"""By view, positions [px], NaN where a track is not seen, and where it is seen."""
+
 _cv2: Any = cv2  # Its type stubs refuse absent starts.
 TRACKING_STAGE = "point_tracking"
 MOST_TRACKS = 400
@@ -37,7 +41,7 @@ LEAST_TRACKS = 220
 
 _WINDOW = (9, 21)
 """Least and largest side of what of an image is matched [px]."""
-_THIN, _LONG_WINDOW = 8.0, 41
+THIN, _LONG_WINDOW = 8.0, 41
 """Thickness up to which an object is thin, and the side of what is matched of nothing but its own
 pixels then [px]."""
 _RETURN, _THIN_RETURN = 0.3, 0.15
@@ -68,7 +72,7 @@ _TORN = 0.25
 """Share of the tracks around it that a sliding one leaves behind."""
 _CLOSEST = 1.4
 """Least distance between tracks when they begin [px]."""
-_SHORTEST = 3
+SHORTEST_TRACK = 3
 """Frames that a track must live to be kept."""
 _MODEL_ROUNDS = 4
 """Most frames of a view in which a model is told points to follow."""
@@ -76,10 +80,10 @@ _MODEL_ROUNDS = 4
 
 def track_points(
     sequence: Sequence,
-    masks: dict[str, UInt8[ndarray, "frame row column"]],
+    masks: Mapping[str, UInt8[ndarray, "frame row column"]],
     progress: Progress | None = None,
     model: TrackModel | None = None,
-) -> dict[str, tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]]:
+) -> PixelTracks:
     """Follow points of the object's surface.
 
     Args:
@@ -98,7 +102,8 @@ def track_points(
     """
     progress = progress or NullProgress()
     views = [v for v in sequence.views if v.name in masks and v.has_color and v.has_depth]
-    total, result = len(views) * sequence.frame_count, {}
+    total = len(views) * sequence.frame_count
+    result: PixelTracks = {}
     for number, view in enumerate(views):
         if model is not None:
             paths = _followed_by_model(model, view, masks[view.name], progress)
@@ -146,8 +151,8 @@ class _Tracker:
         """Go on to a frame, the first or the next one."""
         gray = cv2.cvtColor(self._view.color(frame), cv2.COLOR_RGB2GRAY)
         is_object = self._mask[frame] == OBJECT_LABEL
-        depth = _solid_depth(self._view.depth(frame), is_object)
-        if 0 < mask_thickness(is_object) <= _THIN:
+        depth = solid_depth(self._view.depth(frame), is_object)
+        if 0 < mask_thickness(is_object) <= THIN:
             self._own[frame] = _own_pixels(gray, is_object)
         self._gray[frame] = gray
         if self._alive:
@@ -163,7 +168,7 @@ class _Tracker:
             for image in images.keys() - used:
                 del images[image]
         pixel = np.array([self._paths[track].pixel[-1] for track in self._alive])
-        self._depth = _at(depth, pixel.reshape(-1, 2))
+        self._depth = pixel_values(depth, pixel.reshape(-1, 2))
         self._tie(pixel.reshape(-1, 2), np.array(self._alive, dtype=np.int64) >= known)
 
     def _advance(
@@ -186,8 +191,8 @@ class _Tracker:
             end, is_found = _follow(self._gray[frame - 1], self._gray[frame], start, size)
             is_same = self._laid_onto_beginning(self._gray, frame, end, size, _FIRST_RETURN)
             is_found &= is_same | is_young
-        here = _at(depth, end)
-        is_good = is_found & (_at(is_object, end) > 0)
+        here = pixel_values(depth, end)
+        is_good = is_found & (pixel_values(is_object, end) > 0)
         is_good &= (here == 0) | (self._depth == 0) | (np.abs(here - self._depth) < _DEPTH_JUMP)
         is_good &= _moves_with_neighbors(start, end, is_good)
         is_good &= ~self._is_torn(end, here, is_good)
@@ -261,7 +266,7 @@ class _Tracker:
 
     def paths(self) -> tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]:
         """Lay the tracks that lived long enough side by side."""
-        least = min(_SHORTEST, self._view.frame_count)
+        least = min(SHORTEST_TRACK, self._view.frame_count)
         kept = [path for path in self._paths if len(path.pixel) >= least]
         pixel = np.full((self._view.frame_count, len(kept), 2), np.nan, dtype=np.float32)
         for track, path in enumerate(kept):
@@ -275,7 +280,10 @@ def visible_on_object(
     is_visible: Bool[ndarray, "frame track"],
 ) -> Bool[ndarray, "frame track"]:
     """Tell which of the visible points are on the object, as its masks say."""
-    on = [_at(label == OBJECT_LABEL, place) > 0 for label, place in zip(mask, pixel, strict=True)]
+    on = [
+        pixel_values(label == OBJECT_LABEL, place) > 0
+        for label, place in zip(mask, pixel, strict=True)
+    ]
     return is_visible & np.stack(on)
 
 
@@ -303,7 +311,7 @@ def _followed_by_model(
             break
         asked.add(frame)
         gray = cv2.cvtColor(view.color(frame), cv2.COLOR_RGB2GRAY)
-        free = _solid_depth(view.depth(frame), is_object[frame]) > 0
+        free = solid_depth(view.depth(frame), is_object[frame]) > 0
         start = _new_points(gray, free, pixel[frame, seen[frame]])
         if not len(start):
             continue
@@ -311,12 +319,12 @@ def _followed_by_model(
         is_visible = visible_on_object(mask, place, is_visible)
         pixel = np.concatenate([pixel, place.astype(np.float32)], axis=1)
         seen = np.concatenate([seen, is_visible], axis=1)
-    kept = seen.sum(axis=0) >= min(_SHORTEST, view.frame_count)
+    kept = seen.sum(axis=0) >= min(SHORTEST_TRACK, view.frame_count)
     pixel, seen = pixel[:, kept], seen[:, kept]
     return np.where(seen[..., None], pixel, np.float32(np.nan)), seen
 
 
-def _solid_depth(
+def solid_depth(
     depth: Float[ndarray, "row column"], is_object: Bool[ndarray, "row column"]
 ) -> Float[ndarray, "row column"]:
     """Leave only the object's depth, without single wrong values; 0 elsewhere."""
@@ -327,7 +335,7 @@ def _solid_depth(
     return np.where((count > 0.3) & is_object, mean, 0.0)
 
 
-def _at(image: ndarray, pixel: Float[ndarray, "track 2"]) -> ndarray:
+def pixel_values(image: ndarray, pixel: Float[ndarray, "track 2"]) -> ndarray:
     """Look up the values of the nearest pixels; 0 outside."""
     height, width = image.shape
     column, row = np.nan_to_num(pixel, nan=-1e6).round().astype(np.int64).T
