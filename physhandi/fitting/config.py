@@ -71,9 +71,14 @@ class HandFitConfig(Settings, frozen=True, kw_only=True):
     depth_learning_rate: Rate = 0.03
     """The same for the fit to keypoints and depth."""
     starts_at_depth: bool = True
-    """Whether the hand is moved to where depth was measured before the first update; with one view,
-    depth also tells each frame's pose from its mirror image. In views without masks, the hand's
-    depth is that at its keypoints."""
+    """Whether the hand is moved to where depth was measured before the first update. In views
+    without masks, the hand's depth is that at its keypoints."""
+    search_iterations: Count = 80
+    """Updates of the search that takes the place of the fit to keypoints where one view alone
+    places the hand and it starts at depth: it tells how the hand is turned and bent; 0 for none."""
+    free_space_weight: Weight = 1.0
+    """Weight, after that search, of keypoints that stand before the surface that was measured, in
+    units of the expected depth error, squared."""
     fixed_normals: bool = True
     """Whether the hand's normals stay as they are between two searches for the vertices that
     measured points correspond to. Only these vertices are computed then, which is much faster."""

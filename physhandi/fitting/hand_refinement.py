@@ -18,7 +18,8 @@ from torch import Tensor
 from physhandi.data.checkpoint import Checkpointer, resumed_note
 from physhandi.errors import SimulationDivergedError
 from physhandi.fitting.config import RefinementConfig as RefinementConfig
-from physhandi.fitting.hand_reconstruction import KeypointTarget, reprojection_loss
+from physhandi.fitting.hands.losses import reprojection_loss
+from physhandi.fitting.hands.observed import KeypointTarget
 from physhandi.fitting.object_problem import ObjectProblem, problem_parameters
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.hand.model import HandModel, HandPose

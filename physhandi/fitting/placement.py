@@ -23,8 +23,9 @@ from physhandi.data.view import View
 from physhandi.errors import FitError, MissingInputError, RunError
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import PipelineConfig
-from physhandi.fitting.hand_reconstruction import HandFit, keypoint_target, reconstruct_hands
+from physhandi.fitting.hand_reconstruction import HandFit, reconstruct_hands
 from physhandi.fitting.hand_refinement import RefinedHands, RefinementProblem, refine_hands
+from physhandi.fitting.hands.observed import keypoint_target
 from physhandi.fitting.object_problem import ObjectProblem, initial_velocity
 from physhandi.fitting.rest_state import hold_still, rest_in_place, resting_clearance
 from physhandi.fitting.rope.bending import gripped

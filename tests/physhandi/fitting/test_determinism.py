@@ -13,13 +13,14 @@ from hand_scene import grasping
 
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, RefinementConfig
-from physhandi.fitting.hand_reconstruction import DepthTarget, depth_loss
 from physhandi.fitting.hand_refinement import (
     RefinedHands,
     Refinement,
     RefinementProblem,
     refine_hands,
 )
+from physhandi.fitting.hands.losses import depth_loss
+from physhandi.fitting.hands.observed import DepthTarget
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.spring_optimisation import Material, SpringDescent
 from physhandi.hand.loading import load_hand_model

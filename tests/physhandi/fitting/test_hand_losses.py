@@ -1,23 +1,25 @@
 """The terms of stage 1 against closed forms."""
 
 import math
+from pathlib import Path
 
+import hand_scene as scene
 import numpy as np
 import pytest
 import torch
 
 from physhandi.data.camera import PinholeCamera, triangulate
-from physhandi.fitting.hand_reconstruction import (
+from physhandi.fitting.hands.losses import (
     JOINT_LIMIT,
-    DepthTarget,
     depth_loss,
+    free_space_loss,
     hand_acceleration_loss,
-    keypoint_target,
     limit_loss,
     reprojection_loss,
     velocity_loss,
     vertex_normals_torch,
 )
+from physhandi.fitting.hands.observed import DepthTarget, FreeSpace, free_space, keypoint_target
 from physhandi.hand.loading import load_hand_model
 
 
@@ -121,3 +123,49 @@ def test_triangulation_returns_the_point_or_nothing() -> None:
     assert np.isnan(point[2]).all(), "only one view sees it"
     assert np.isnan(point[3]).all(), "the views disagree"
     assert np.isnan(triangulate(cameras[:1], pixel[:1], weight[:1], 5.0)).all()
+
+
+def _space(depth: float) -> FreeSpace:
+    """A camera at the origin that measured one depth to the left, and nothing to the right."""
+    measured = torch.zeros(1, 2, 64, 64)
+    measured[..., :32] = depth
+    projection = torch.tensor([[[100.0, 0, 50, 0], [0, 100, 50, 0], [0, 0, 1, 0]]])
+    return FreeSpace(measured, torch.zeros(1, 2, 2), torch.full((1, 2), 100 / 63), projection)
+
+
+def test_keypoints_cost_where_a_camera_looked_through_them_and_nowhere_else() -> None:
+    point = torch.zeros(2, 21, 3)
+    point[..., 0], point[..., 2] = -0.2, 1.1
+    space = _space(1.0)
+    assert float(free_space_loss(point, space, 0.004)) == 0  # Hidden by the surface.
+    point[0, 3, 2] = 0.995
+    point.requires_grad_()
+    loss = free_space_loss(point, space, 0.004)
+    expected = 9 * math.log1p((0.008 / 0.004) ** 2 / 9) / 2
+    assert float(loss.detach()) == pytest.approx(expected, rel=1e-3)
+    (gradient,) = torch.autograd.grad(loss, point)
+    assert float(gradient[0, 3, 2]) < 0  # Farther away is better.
+    with torch.no_grad():
+        gradient[0, 3] = 0
+        assert not gradient.any()
+        for place in ([0.2, 0.0, 0.995], [-0.2, 0.0, 0.9], [-0.9, 0.0, 0.995]):
+            # Nothing was measured there; before another thing's edge; out of what was read.
+            point[0, 3] = torch.tensor(place)
+            assert float(free_space_loss(point, space, 0.004)) == 0
+
+
+def test_free_space_is_read_around_the_keypoints_through_the_lens(tmp_path: Path) -> None:
+    truth, camera = scene.grasping(frames=2), scene.looking_at_hand(0.0)
+    keypoint = scene.seen_keypoints([truth], [camera])
+    keypoint[0, 1] = np.nan
+    sequence = scene.write_scene(tmp_path / "a", [truth], [camera], keypoint, depth=True)
+    space = free_space(sequence.views, keypoint_target([camera], keypoint[:, :, 0], 0.015))
+    assert not space.depth[0, 1].any()  # Nobody knows where the hand is.
+    vertex = truth.vertices(load_hand_model("right"))[0].astype(np.float64)
+    cell = camera.undistort(camera.project(vertex)) - space.corner[0, 0].numpy()
+    column, row = np.round(cell / float(space.step[0, 0])).astype(int).T
+    assert min(column.min(), row.min()) >= 0
+    assert max(column.max(), row.max()) < 64
+    behind = camera.camera_depth(vertex) - space.depth[0, 0].numpy()[row, column]
+    assert np.quantile(np.abs(behind), 0.3) < 0.003  # The side that is seen.
+    assert np.quantile(behind, 0.05) > -0.006  # Nothing of the hand is before what was measured.

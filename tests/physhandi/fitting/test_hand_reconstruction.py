@@ -3,7 +3,6 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import hand_scene as scene
@@ -19,20 +18,15 @@ from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, FitError, MissingInputError, SettingsError
-from physhandi.fitting.checks.readiness import PALM
 from physhandi.fitting.hand_reconstruction import (
-    DepthTarget,
     HandFit,
     HandFitConfig,
-    _guess_from_one_view,
-    _mirrored,
-    _told_from_mirrored,
     _without_jumps,
-    depth_target,
     observed_keypoints,
     reconstruct_hands,
-    way_to_depth,
 )
+from physhandi.fitting.hands.observed import DepthTarget, depth_target
+from physhandi.fitting.hands.wrist_guess import way_to_depth
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.metrics.hands import evaluate_hands
@@ -141,30 +135,6 @@ def test_a_turn_by_more_than_half_a_circle_goes_on_without_a_jump() -> None:
     vector = Rotation.from_rotvec(turned).as_rotvec()
     assert np.abs(np.diff(vector, axis=0)).max() > 3.0
     np.testing.assert_allclose(_without_jumps(vector), turned, atol=1e-9)
-
-
-def test_depth_tells_a_pose_from_its_mirror_image(tmp_path: Path) -> None:
-    truth, model = scene.grasping(frames=6), load_hand_model("right")
-    keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
-    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
-    depth = depth_target(sequence, "right", 128)
-    assert depth is not None
-    palm, seen = list(PALM), keypoint[:, :, 0][:, :, list(PALM)]
-    template = model.keypoint_position[palm]
-    true = Rotation.from_rotvec(truth.wrist_rotation)
-    guesses: list[Any] = [
-        _guess_from_one_view(CAMERAS[:1], seen[:, frame], template) for frame in range(6)
-    ]
-    assert all(guess is not None for guess in guesses)
-    wrong = list(guesses)
-    for frame in (0, 2, 3):
-        wrong[frame] = _mirrored(CAMERAS[:1], seen[:, frame], template, guesses[frame])[0]
-        assert (wrong[frame][0] * true[frame].inv()).magnitude() > 0.8
-    wrong[4] = None  # Nothing is known of it, and nothing is made up.
-    told: list[Any] = _told_from_mirrored(CAMERAS[:1], seen, model, wrong, depth)
-    assert told[4] is None
-    for frame in (0, 1, 2, 3, 5):
-        assert (told[frame][0] * true[frame].inv()).magnitude() < 0.5
 
 
 def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_one(
@@ -326,12 +296,11 @@ def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("is_new", "stops", "told"), [(True, (1, 2, 2), [30, 40, 45]), (False, (3,), [30, 40, 45])]
+    ("is_new", "stops"), [(True, (3,)), (False, (1, 2, 2))], ids=["searched", "keypoints_first"]
 )
 def test_a_stopped_fit_goes_on_to_the_same_bits(
     is_new: bool,
     stops: tuple[int, ...],
-    told: list[int],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -340,14 +309,19 @@ def test_a_stopped_fit_goes_on_to_the_same_bits(
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
     config = HandFitConfig(
-        iterations=20, depth_iterations=25, starts_at_depth=is_new, fixed_normals=is_new
+        iterations=20,
+        search_iterations=20,
+        depth_iterations=25,
+        starts_at_depth=is_new,
+        fixed_normals=is_new,
     )
 
     def fit(progress: Progress, checkpointer: Checkpointer | None) -> HandFit:
         return reconstruct_hands(sequence, config, progress, checkpointer=checkpointer)
 
-    # Once before depth is seen, at the end of that, and between two looks for nearest vertices.
-    reports = check_resumed(fit, tmp_path / "ckpt", (1, 2, 2))
+    # Once before depth is seen, at the end of that, and between two looks for nearest vertices; a
+    # search is not stored, and the only stop is between two looks.
+    reports = check_resumed(fit, tmp_path / "ckpt", stops)
     assert [report[1] for report in reports] == [30, 40, 45]
 
 

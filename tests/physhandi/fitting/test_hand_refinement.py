@@ -16,13 +16,13 @@ from stopped_fits import check_resumed, write_always
 from physhandi.data.checkpoint import Checkpointer
 from physhandi.errors import CancelledError, SettingsError, SimulationDivergedError
 from physhandi.fitting import hand_refinement
-from physhandi.fitting.hand_reconstruction import keypoint_target
 from physhandi.fitting.hand_refinement import (
     Refinement,
     RefinementConfig,
     RefinementProblem,
     refine_hands,
 )
+from physhandi.fitting.hands.observed import keypoint_target
 from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.parameters import SimulationParameters

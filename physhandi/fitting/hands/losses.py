@@ -1,0 +1,219 @@
+"""The terms of the loss that stage 1 descends, and costs of single frames."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from physhandi.fitting.hands.observed import DepthTarget, FreeSpace, KeypointTarget
+from physhandi.hand.model import HandModel
+
+_KNUCKLE = ((-1.7, 0.6), (-0.4, 0.4), (-0.25, 0.25))
+_MIDDLE = ((-2.0, 0.2), (-0.08, 0.08), (-0.08, 0.08))
+_LAST = ((-1.5, 0.4), (-0.08, 0.08), (-0.08, 0.08))
+_THUMB = (
+    ((-0.9, 0.9), (-0.9, 0.9), (-0.6, 0.6)),
+    ((-1.2, 0.6), (-0.4, 0.4), (-0.3, 0.3)),
+    ((-1.6, 0.6), (-0.15, 0.15), (-0.15, 0.15)),
+)
+JOINT_LIMIT = np.array([*_THUMB, *([_KNUCKLE, _MIDDLE, _LAST] * 4)])
+"""Lower and upper bound of each joint's rotation vector, for a right hand [rad]."""
+_CANDIDATES = 8
+"""Nearest vertices among which a measured point looks for one that faces the camera."""
+REFRESH = 10
+"""Evaluations of the depth loss between two searches for corresponding vertices."""
+_DOUBT = 3.0
+"""Depth errors beyond this many standard deviations lose their pull (Cauchy's loss)."""
+_SKIN = 0.003
+"""Least depth of a keypoint under the hand's surface [m]."""
+_EDGE = 0.03
+"""A keypoint that is farther than this before what was measured is at an edge in the image [m]."""
+
+
+def reprojection_loss(
+    point: Float[Tensor, "frame 21 3"], target: KeypointTarget, breadth: float
+) -> Float[Tensor, ""]:
+    """Compare projected with observed keypoints: sum over keypoints, mean over frames.
+
+    Args:
+        point: Keypoints in the world frame.
+        target: Observed keypoints.
+        breadth: ``c`` of `keypoint_costs`.
+    """
+    return keypoint_costs(point, target, breadth).sum() / point.shape[0]
+
+
+def keypoint_costs(
+    point: Float[Tensor, "frame 21 3"], target: KeypointTarget, breadth: float
+) -> Float[Tensor, "view frame 21"]:
+    """Compare each projected with its observed keypoint.
+
+    Cauchy's robust loss ``c² log(1 + (r / c)²)`` of the distance ``r`` in units of the expected
+    noise, so that gross outliers have almost no gradient.
+
+    Args:
+        point: Keypoints in the world frame.
+        target: Observed keypoints.
+        breadth: ``c``, in units of noise.
+    """
+    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
+    projected = torch.einsum("vij,fkj->vfki", target.projection, homogeneous)
+    depth = projected[..., 2:]
+    nearest = 1e-3 * depth.detach().abs().median()
+    pixel = projected[..., :2] / depth.clamp(min=float(nearest) + 1e-9)
+    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
+    robust = breadth**2 * torch.log1p(squared / breadth**2)
+    return target.weight * robust
+
+
+def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> Float[Tensor, ""]:
+    """Sum the squared violations of the joint limits, averaged over frames [rad²]."""
+    return limit_costs(articulation, model).sum() / articulation.shape[0]
+
+
+def limit_costs(
+    articulation: Float[Tensor, "frame 15 3"], model: HandModel
+) -> Float[Tensor, "frame 15 3"]:
+    """Square how far each joint is beyond its limits [rad²]."""
+    mirror = torch.tensor([1.0, -1.0, -1.0] if model.side == "left" else [1.0, 1.0, 1.0])
+    limit = torch.tensor(JOINT_LIMIT, dtype=articulation.dtype)
+    turned = articulation * mirror
+    beyond = (limit[..., 0] - turned).relu() + (turned - limit[..., 1]).relu()
+    return beyond**2
+
+
+def hand_acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
+    """Sum the squared second differences of the keypoints over time, averaged over frames."""
+    if point.shape[0] < 3:
+        return point.sum() * 0
+    second = point[2:] - 2 * point[1:-1] + point[:-2]
+    return (second**2).sum() / point.shape[0]
+
+
+def velocity_loss(point: Float[Tensor, "frame joint 3"]) -> Float[Tensor, ""]:
+    """Sum the squared differences from frame to frame, averaged over frames."""
+    return ((point[1:] - point[:-1]) ** 2).sum() / point.shape[0]
+
+
+def depth_loss(
+    vertex: Float[Tensor, "frame vertex 3"],
+    faces: Tensor,
+    target: DepthTarget,
+    noise: float,
+) -> Float[Tensor, ""]:
+    """Measure how far points lie from the surface, mostly along its normal (Cauchy's loss).
+
+    Args:
+        vertex: The hand's surface in the world frame [m].
+        faces: Its triangles.
+        target: Measured points; every tenth call updates the vertices they correspond to.
+        noise: Expected error of a measurement [m].
+
+    Returns:
+        Mean over points, then frames, in units of the noise, squared.
+    """
+    normal = vertex_normals_torch(vertex, faces)
+    if target.vertex is None or target.age >= REFRESH:
+        target.vertex, target.age = correspond(vertex.detach(), normal.detach(), target), 0
+    target.age += 1
+    index = target.vertex[..., None].expand(-1, -1, 3)
+    offset = target.point - vertex.gather(1, index)
+    return distance_loss(offset, normal.gather(1, index), target.weight, noise)
+
+
+def distance_loss(
+    offset: Float[Tensor, "frame point 3"],
+    normal: Float[Tensor, "frame point 3"],
+    weight: Float[Tensor, "frame point"],
+    noise: float,
+) -> Float[Tensor, ""]:
+    """Measure distances from a surface, mostly along its normal (Cauchy's loss).
+
+    Args:
+        offset: Way from the surface to each point [m].
+        normal: Normal of the surface there.
+        weight: Share of each point in its frame; zero on padding.
+        noise: Expected error of a point [m].
+
+    Returns:
+        Mean over points, then frames, in units of the noise, squared.
+    """
+    costs = distance_costs(offset, normal, weight, noise)
+    return costs.sum() / max(int((weight.sum(1) > 0).sum()), 1)
+
+
+def distance_costs(
+    offset: Float[Tensor, "frame point 3"],
+    normal: Float[Tensor, "frame point 3"],
+    weight: Float[Tensor, "frame point"],
+    noise: float,
+) -> Float[Tensor, "frame point"]:
+    """Measure each point's distance as `distance_loss` does, times its weight."""
+    along = (offset * normal).sum(-1)
+    aside = ((offset**2).sum(-1) - along**2).clamp(min=0)
+    squared = (along**2 + 0.1 * aside) / noise**2
+    robust = _DOUBT**2 * torch.log1p(squared / _DOUBT**2)
+    return weight * robust
+
+
+def vertex_normals_torch(
+    vertex: Float[Tensor, "frame vertex 3"], faces: Tensor
+) -> Float[Tensor, "frame vertex 3"]:
+    """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
+    a, b, c = (vertex.index_select(1, faces[:, corner]) for corner in range(3))
+    normal = torch.cross(b - a, c - a, dim=-1)
+    total = torch.zeros_like(vertex)
+    for corner in range(3):
+        total = total.index_add(1, faces[:, corner], normal)
+    return total / total.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+
+
+def correspond(vertex: Tensor, normal: Tensor, target: DepthTarget) -> Tensor:
+    """Find for each point the nearest vertex among its neighbours that faces the camera."""
+    chosen = torch.zeros(target.weight.shape, dtype=torch.int64)
+    for frame in range(len(vertex)):
+        count = int((target.weight[frame] > 0).sum())
+        if not count:
+            continue
+        tree = KDTree(vertex[frame].numpy())
+        near = np.asarray(tree.query(target.point[frame, :count].numpy(), k=_CANDIDATES)[1])
+        facing = normal[frame][near] * target.towards_camera[frame, :count, None]
+        first = (facing.sum(-1) > 0).numpy().argmax(axis=1)
+        chosen[frame, :count] = torch.from_numpy(
+            np.take_along_axis(near, first[:, None], axis=1)[:, 0]
+        )
+    return chosen
+
+
+def free_space_loss(
+    point: Float[Tensor, "frame 21 3"], space: FreeSpace, noise: float
+) -> Float[Tensor, ""]:
+    """Push keypoints away from where a camera looked through: behind the surface it measured.
+
+    What lies behind it may be hidden, and costs nothing. Far behind is another thing, at whose edge
+    a keypoint appears that is a pixel off: that costs nothing either.
+
+    Args:
+        point: Keypoints in the world frame [m].
+        space: What cameras measured around the hand.
+        noise: Expected error of a measurement [m].
+
+    Returns:
+        Sum over keypoints and views, mean over frames, in units of the noise, squared.
+    """
+    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
+    projected = torch.einsum("vij,fkj->vfki", space.projection, homogeneous)
+    depth = projected[..., 2]
+    with torch.no_grad():
+        pixel = projected[..., :2] / depth[..., None].clamp(min=1e-3)
+        cell = (pixel - space.corner[:, :, None]) / space.step[:, :, None, None]
+        cell = cell.round().clamp(-1, space.depth.shape[-1])
+        is_known = ((cell >= 0) & (cell < space.depth.shape[-1])).all(-1)
+        column, row = cell.long().clamp(0, space.depth.shape[-1] - 1).unbind(-1)
+        view, frame = (torch.arange(count) for count in space.depth.shape[:2])
+        measured = space.depth[view[:, None, None], frame[None, :, None], row, column]
+        is_known &= (measured > 0) & (measured - depth < _EDGE)
+    before = torch.where(is_known, measured + _SKIN - depth, 0.0).relu()
+    squared = before**2 / noise**2
+    return (_DOUBT**2 * torch.log1p(squared / _DOUBT**2)).sum() / point.shape[0]
