@@ -92,6 +92,11 @@ class PinholeCamera:
         """Move pixels to where a lens without distortion would have seen them [px]."""
         return self._ray(pixel) @ self.K[:2, :2].T + self.K[:2, 2]
 
+    def distort(self, pixel: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 2"]:
+        """Move pixels from there to where the camera recorded them [px]; the way back."""
+        ray = (pixel - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+        return self._distort(ray) @ self.K[:2, :2].T + self.K[:2, 2]
+
     def unproject(
         self, pixel: Float[ndarray, "*batch 2"], depth: Float[ndarray, "*batch"]
     ) -> Float[ndarray, "*batch 3"]:

@@ -25,6 +25,7 @@ from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.checks.readiness import REMEDIES, missing_for_hands
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.hands.losses import (
+    DEPTH_DOUBT,
     REFRESH,
     correspond,
     depth_loss,
@@ -34,7 +35,6 @@ from physhandi.fitting.hands.losses import (
     limit_loss,
     reprojection_loss,
     velocity_loss,
-    vertex_normals_torch,
 )
 from physhandi.fitting.hands.observed import (
     DepthTarget,
@@ -44,20 +44,22 @@ from physhandi.fitting.hands.observed import (
     free_space,
     keypoint_target,
 )
+from physhandi.fitting.hands.poses import (
+    PosedHands,
+    doubt_breadth,
+    hand_optimizer,
+    step_share,
+)
 from physhandi.fitting.hands.search import SearchedHand, search_hand
 from physhandi.fitting.hands.wrist_guess import WristGuess, guess_wrist, way_to_depth
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.names import HandSide
-from physhandi.hand.rotation import quaternion_matrix
 from physhandi.one_thread import one_thread
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import NullProgress, Preview, Progress
 
-_FAR_OFF = 3.0
-"""Depth errors from which a hand is moved to the measured depth as a whole, in standard deviations
-(beyond them, points lose their pull)."""
 _Step = Callable[[int, Tensor, Adam | None], None]
 """Receives the number of an update, its loss, and the optimizer if it can be stored."""
 HAND_STAGE = "hand_reconstruction"
@@ -202,6 +204,7 @@ class HandProblem:
         )
         self.frame_rate = sequence.frame_rate
         self.parameters = _parameters(guess, len(keypoint[0]))
+        self._hands = PosedHands(model, self.parameters)
         self.name = sequence.name
         self.joints: Tensor | None = None
         """The 21 keypoints of every frame in the latest evaluation, for previews."""
@@ -215,33 +218,21 @@ class HandProblem:
                 self._searched = SearchedHand(
                     cameras, keypoint, self.target, self.depth, guess, model, self.frame_rate
                 )
-                self.space = free_space(sequence.views, self.target)
-
-    def hand(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Shape, wrist rotation, wrist position [m] and scale."""
-        p = self.parameters
-        rotation = quaternion_matrix(p["rotation"])
-        return 3 * torch.tanh(p["shape"] / 3), rotation, p["translation"], p["log_scale"].exp()
+                if config.free_space_weight:
+                    self.space = free_space(sequence.views, self.target)
 
     def loss(self, breadth: float) -> Tensor:
         """Compute the keypoint loss and the priors; depth is not in it."""
-        return self._loss_of(self._keypoints(), breadth)
+        return self._loss_of(self._hands.keypoints(), breadth)
 
     def loss_with_depth(self, target: DepthTarget) -> Tensor:
         """Compute the loss and what depth adds to it."""
-        metres = self._keypoints()
+        metres = self._hands.keypoints()
         loss = self._loss_of(metres, self.config.doubt) + self.depth_term(target)
         if self.space is None:
             return loss
         free = free_space_loss(metres, self.space, self.config.depth_noise)
         return loss + self.config.free_space_weight * free
-
-    def _keypoints(self) -> Float[Tensor, "frame 21 3"]:
-        """Pose the keypoints in every frame [m, before scale]."""
-        shape, rotation, translation, _ = self.hand()
-        still = torch.zeros_like(translation)
-        local = self.model.keypoints(shape, self.parameters["articulation"], still, still)
-        return local @ rotation.transpose(-1, -2) + translation[:, None]
 
     def _loss_of(self, metres: Float[Tensor, "frame 21 3"], breadth: float) -> Tensor:
         config, articulation = self.config, self.parameters["articulation"]
@@ -260,29 +251,21 @@ class HandProblem:
 
     def depth_term(self, target: DepthTarget) -> Tensor:
         """Compute the weighted depth loss."""
-        faces, noise = torch.from_numpy(self.model.faces), self.config.depth_noise
+        hands, noise = self._hands, self.config.depth_noise
         if not self.config.fixed_normals:
-            return self.config.depth_weight * depth_loss(self.surface(), faces, target, noise)
+            faces = torch.from_numpy(self.model.faces)
+            return self.config.depth_weight * depth_loss(hands.surface(), faces, target, noise)
         if target.vertex is None or target.normal is None or target.age >= REFRESH:
             with torch.no_grad():
-                surface = self.surface()
-                normal = vertex_normals_torch(surface, faces)
+                surface = hands.surface()
+                normal = hands.normals(surface)
                 target.vertex, target.age = correspond(surface, normal, target), 0
                 index = target.vertex[..., None].expand(-1, -1, 3)
                 target.normal = normal.gather(1, index)
         target.age += 1
-        shape, rotation, translation, _ = self.hand()
-        local = self.model.chosen_vertices(target.vertex, shape, self.parameters["articulation"])
-        vertex = local @ rotation.transpose(-1, -2) + translation[:, None]
-        loss = distance_loss(target.point - vertex, target.normal, target.weight, noise)
+        offset = target.point - hands.vertices(target.vertex)
+        loss = distance_loss(offset, target.normal, target.weight, noise)
         return self.config.depth_weight * loss
-
-    def surface(self) -> Float[Tensor, "frame vertex 3"]:
-        """Pose the hand's vertices in every frame [m, before scale]."""
-        shape, rotation, translation, _ = self.hand()
-        still = torch.zeros_like(translation)
-        local = self.model(shape, self.parameters["articulation"], still, still).vertex
-        return local @ rotation.transpose(-1, -2) + translation[:, None]
 
     def solve(self, progress: Progress, checkpointer: Checkpointer) -> SolvedHand:
         """Fit to keypoints, then to keypoints and depth."""
@@ -342,15 +325,14 @@ class HandProblem:
         """Descend on keypoints and place the hand by depth, or search; then descend on both."""
         config, depth, first = self.config, self.depth, self._first_iterations()
 
-        def widening(iteration: int) -> float:
-            share = min(iteration / (0.6 * config.iterations), 1.0)
-            return config.doubt * 10 ** (1 - share)
+        def loss_at(iteration: int) -> Tensor:
+            return self.loss(doubt_breadth(config.doubt, iteration, config.iterations))
 
         if self._searched is None and (resumed is None or resumed.iteration <= first):
             self._descend(
                 config.iterations,
                 config.learning_rate,
-                lambda iteration: self.loss(widening(iteration)),
+                loss_at,
                 step,
                 first=0,
                 resumed=resumed,
@@ -374,10 +356,10 @@ class HandProblem:
         One view tells how far away a hand is by its size alone, which differs from hand to hand.
         """
         with torch.no_grad():
-            vertex = self.surface()
-            normal = vertex_normals_torch(vertex, torch.from_numpy(self.model.faces))
+            vertex = self._hands.surface()
+            normal = self._hands.normals(vertex)
             move = way_to_depth(vertex.numpy(), normal.numpy(), target, self.frame_rate)
-            if np.median(np.linalg.norm(move, axis=1)) > _FAR_OFF * self.config.depth_noise:
+            if np.median(np.linalg.norm(move, axis=1)) > DEPTH_DOUBT * self.config.depth_noise:
                 self.parameters["translation"].add_(torch.from_numpy(move.astype(np.float32)))
 
     def _show(self, loss: float, progress: Progress) -> None:
@@ -412,25 +394,14 @@ class HandProblem:
             optimizer.zero_grad()
             loss = loss_at(iteration)
             loss.backward()
-            optimizer.step(0.05 + 0.475 * (1 + math.cos(math.pi * iteration / iterations)))
+            optimizer.step(step_share(iteration, iterations))
             step(first + iteration + 1, loss, optimizer)
 
     def _optimizer(self, rate: float) -> Adam:
-        share = {
-            "shape": 2.0,
-            "articulation": 1.0,
-            "rotation": 0.3,
-            "translation": 0.1,
-            "log_scale": 0.1,
-        }
-        return Adam(
-            [
-                (value.requires_grad_(), rate * share[name])
-                for name, value in self.parameters.items()
-                if not (self.metric and name == "log_scale")
-            ],
-            betas=(0.9, 0.99),
-        )
+        changed = dict(self.parameters)
+        if self.metric:
+            del changed["log_scale"]
+        return hand_optimizer(changed, rate)
 
     def _depth_state(self) -> dict[str, ndarray]:
         """Copy which vertices measured points correspond to; the age is -1 before they do."""
@@ -458,7 +429,8 @@ class HandProblem:
 
     def _motion(self) -> HandMotion:
         with torch.no_grad():
-            shape, rotation, translation, scale = self.hand()
+            shape, rotation = self._hands.shape(), self._hands.rotation()
+            scale = self.parameters["log_scale"].exp()
         turn = Rotation.from_matrix(rotation.numpy()).as_rotvec()
         return HandMotion(
             side=self.model.side,
@@ -466,7 +438,7 @@ class HandProblem:
             shape=shape.numpy().astype(np.float32),
             articulation=self.parameters["articulation"].detach().numpy().copy(),
             wrist_rotation=_without_jumps(turn).astype(np.float32),
-            wrist_translation=translation.detach().numpy().copy(),
+            wrist_translation=self.parameters["translation"].detach().numpy().copy(),
             scale=1.0 if self.metric else float(scale),
         )
 

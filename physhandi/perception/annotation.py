@@ -210,10 +210,13 @@ def _follow(
     method: dict[str, str] = {}
     if tracker is None:
         seen = {view.name: masks[view.name] for view in views if view.name in masks}
-        if is_thin(seen):
-            views = [view for view in views if view.name in masks or view.has_mask]
-            seen |= {view.name: _stored_masks(view) for view in views if view.name not in masks}
-        if is_thin(seen):
+        others = [view for view in views if view.name not in masks and view.has_mask]
+        is_thin_object = is_thin(seen)
+        if is_thin_object and others:
+            seen |= {view.name: _stored_masks(view) for view in others}
+            is_thin_object = is_thin(seen)
+        if is_thin_object:
+            views = [view for view in views if view.name in seen]
             tracks, trouble = thin_tracks(views, seen, sequence.frame_rate, progress)
             if tracks:
                 return tracks, {"method": LENGTHS_ALONG}

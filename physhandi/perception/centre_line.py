@@ -151,9 +151,27 @@ def _regression(
     """Smooth places by local linear regression over a Gaussian of the length along the line."""
     away = along - at[:, None]
     share = np.exp(-0.5 * (away / radius) ** 2) * weight
+    return local_regression(away, share, 1e-12 * radius**2) @ place
+
+
+def local_regression(
+    away: Float[ndarray, "place value"], share: Float[ndarray, "place value"], least_spread: float
+) -> Float[ndarray, "place value"]:
+    """Find how much values count for lines that are laid through them, at one place each.
+
+    Args:
+        away: How far values are from each place.
+        share: How much they count there.
+        least_spread: Variance of these distances up to which they tell no slope: then the line is
+            level.
+    """
     total, first, second = ((share * away**power).sum(axis=1) for power in range(3))
-    spread = np.maximum(total * second - first**2, 1e-12 * radius**2 * total**2)
-    return ((second[:, None] - first[:, None] * away) * share / spread[:, None]) @ place
+    spread = total * second - first**2
+    is_slope = spread > least_spread * total**2
+    slope = np.where(is_slope, first, 0.0)[:, None]
+    height = np.where(is_slope, second, 1.0)[:, None]
+    scale = np.where(is_slope, spread, total)[:, None]
+    return (height - slope * away) * share / np.maximum(scale, 1e-300)
 
 
 def _prolonged(corner: Float[ndarray, "corner 3"], length: float) -> Float[ndarray, "longer 3"]:

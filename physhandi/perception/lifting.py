@@ -2,7 +2,7 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from numpy import ndarray
 from scipy.spatial import KDTree
 
@@ -148,6 +148,18 @@ def surface_points(
     rows, columns = np.nonzero(good & (companions >= enough))
     pixel = np.stack([columns, rows], axis=1).astype(np.float64)
     return view.camera.unproject(pixel, depth[rows, columns].astype(np.float64))
+
+
+def pixel_values(
+    image: Shaped[ndarray, "row column"], pixel: Float[ndarray, "*batch 2"]
+) -> Float[ndarray, "*batch"]:
+    """Look up the values of the nearest pixels; 0 outside of the image, and for NaN."""
+    height, width = image.shape
+    column, row = np.moveaxis(np.nan_to_num(pixel, nan=-1e6).round().astype(np.int64), -1, 0)
+    inside: ndarray = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+    value = np.zeros(pixel.shape[:-1], dtype=np.float32)
+    value[inside] = image[row[inside], column[inside]]
+    return value
 
 
 def mask_thickness(is_labelled: Bool[ndarray, "row column"]) -> float:

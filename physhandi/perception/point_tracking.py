@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
-from physhandi.perception.lifting import OBJECT_LABEL, mask_thickness
+from physhandi.perception.lifting import OBJECT_LABEL, mask_thickness, pixel_values
 from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
@@ -333,16 +333,6 @@ def solid_depth(
     count = cv2.blur((own > 0).astype(np.float32), (3, 3))
     mean = cv2.blur(own, (3, 3)) / np.maximum(count, 1e-6)
     return np.where((count > 0.3) & is_object, mean, 0.0)
-
-
-def pixel_values(image: ndarray, pixel: Float[ndarray, "track 2"]) -> ndarray:
-    """Look up the values of the nearest pixels; 0 outside."""
-    height, width = image.shape
-    column, row = np.nan_to_num(pixel, nan=-1e6).round().astype(np.int64).T
-    inside: ndarray = (row >= 0) & (column >= 0) & (row < height) & (column < width)
-    value = np.zeros(len(pixel), dtype=np.float32)
-    value[inside] = image[row[inside], column[inside]]
-    return value
 
 
 def _window_size(is_object: Bool[ndarray, "row column"]) -> int:

@@ -23,12 +23,13 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
 from physhandi.data.view import View
-from physhandi.perception.centre_line import CentreLine, centre_lines
+from physhandi.perception.centre_line import CentreLine, centre_lines, local_regression
 from physhandi.perception.lifting import (
     OBJECT_LABEL,
     VOXEL,
     fuse,
     mask_thickness,
+    pixel_values,
     surface_points,
 )
 from physhandi.perception.point_tracking import (
@@ -36,7 +37,6 @@ from physhandi.perception.point_tracking import (
     THIN,
     TRACKING_STAGE,
     PixelTracks,
-    pixel_values,
     solid_depth,
 )
 from physhandi.perception.shape_class import cell_size
@@ -276,14 +276,8 @@ def _smoothed(
     away = frame - np.arange(frame_count)[:, None]
     for _ in range(3):
         share = np.exp(-0.5 * (away / radius) ** 2) * weight
-        total, first, second = ((share * away**power).sum(axis=1) for power in range(3))
-        spread = total * second - first**2
         # Where the frames around say nothing of how fast it moves, it does not.
-        is_slope = spread > 0.1 * total**2
-        slope = np.where(is_slope, first, 0.0)[:, None]
-        height = np.where(is_slope, second, 1.0)[:, None]
-        scale = np.where(is_slope, spread, total)[:, None]
-        smooth = ((height - slope * away) * share / np.maximum(scale, 1e-300)) @ place
+        smooth = local_regression(away, share, 0.1) @ place
         error = np.linalg.norm(smooth[frame] - place, axis=1)
         weight = 1.0 / np.maximum(1.0, error / _END_ERROR) ** 2
     is_far = np.abs(away).min(axis=1) > _LONGEST_GAP * radius
@@ -328,19 +322,17 @@ def _trouble(
     if not measured:
         return "neither of its ends is seen often enough"
     good = 0
-    whole: list[float] = []
     for frame, candidates in enumerate(lines):
         total = sum(line.length for line in candidates)
         found = [one for chain in measured if (one := chain[frame]) is not None]
         own = {id(one.line): one.line.length for one in found}
         good += bool(found) and sum(own.values()) >= _MEASURED_SHARE * total
-        if len(found) == 2 and len(own) == 1:
-            whole.append(abs(found[0].origin - found[1].origin))
     if good < _MEASURED_FRAMES * shown:
         return (
             f"half of it or more can be measured from an end that is seen in {good} of {shown} "
             "frames: its ends are hidden"
         )
+    whole = _whole_lengths(measured)
     if len(whole) > 1:
         low, high = np.percentile(whole, [10, 90])
         if high - low > _STRETCH * np.median(whole):
@@ -356,26 +348,29 @@ def _paths(measured: list[list[_Measured | None]]) -> list[Float[ndarray, "frame
     """
     extents = [[one.extent for one in chain if one is not None] for chain in measured]
     reach = [max(extent) for extent in extents]
-    if len(measured) == 2:
-        both = list(zip(*measured, strict=True))
-        whole = [
-            abs(a.origin - b.origin)
-            for a, b in both
-            if a is not None and b is not None and a.line is b.line
-        ]
-        if whole:
-            total = float(np.median(whole))
-            cut = [
-                max((x[at].extent for x in both if _is_cut(x, at)), default=0.0) for at in (0, 1)
-            ]
-            middle = 0.5 * (cut[0] + total - cut[1])
-            reach = [max(cut[0], middle), max(cut[1], total - middle)]
+    whole = _whole_lengths(measured)
+    if whole:
+        total, both = float(np.median(whole)), list(zip(*measured, strict=True))
+        cut = [max((x[at].extent for x in both if _is_cut(x, at)), default=0.0) for at in (0, 1)]
+        middle = 0.5 * (cut[0] + total - cut[1])
+        reach = [max(cut[0], middle), max(cut[1], total - middle)]
     parts: list[ndarray] = []
     for chain, length in zip(measured, reach, strict=True):
         arc = np.arange(_SPACING, length, max(_SPACING, length / _MOST_POINTS))
         nothing = np.full((len(arc), 3), np.nan)
         parts.append(np.stack([nothing if one is None else one.places(arc) for one in chain]))
     return parts
+
+
+def _whole_lengths(measured: list[list[_Measured | None]]) -> list[float]:
+    """Measure the thing from end to end in all frames in which both are on one line [m]."""
+    if len(measured) != 2:
+        return []
+    return [
+        abs(a.origin - b.origin)
+        for a, b in zip(*measured, strict=True)
+        if a is not None and b is not None and a.line is b.line
+    ]
 
 
 def _is_cut(ends: tuple[_Measured | None, ...], at: int) -> bool:

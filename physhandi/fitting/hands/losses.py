@@ -23,7 +23,7 @@ _CANDIDATES = 8
 """Nearest vertices among which a measured point looks for one that faces the camera."""
 REFRESH = 10
 """Evaluations of the depth loss between two searches for corresponding vertices."""
-_DOUBT = 3.0
+DEPTH_DOUBT = 3.0
 """Depth errors beyond this many standard deviations lose their pull (Cauchy's loss)."""
 _SKIN = 0.003
 """Least depth of a keypoint under the hand's surface [m]."""
@@ -57,14 +57,25 @@ def keypoint_costs(
         target: Observed keypoints.
         breadth: ``c``, in units of noise.
     """
-    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
-    projected = torch.einsum("vij,fkj->vfki", target.projection, homogeneous)
+    projected = _projected(point, target.projection)
     depth = projected[..., 2:]
     nearest = 1e-3 * depth.detach().abs().median()
     pixel = projected[..., :2] / depth.clamp(min=float(nearest) + 1e-9)
     squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
-    robust = breadth**2 * torch.log1p(squared / breadth**2)
-    return target.weight * robust
+    return target.weight * _cauchy(squared, breadth)
+
+
+def _projected(
+    point: Float[Tensor, "frame point 3"], projection: Float[Tensor, "view 3 4"]
+) -> Float[Tensor, "view frame point 3"]:
+    """Project points of the world: pixels times depth, and depth."""
+    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
+    return torch.einsum("vij,fkj->vfki", projection, homogeneous)
+
+
+def _cauchy(squared: Tensor, breadth: float) -> Tensor:
+    """Let squared errors beyond a breadth lose their pull."""
+    return breadth**2 * torch.log1p(squared / breadth**2)
 
 
 def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> Float[Tensor, ""]:
@@ -153,8 +164,7 @@ def distance_costs(
     along = (offset * normal).sum(-1)
     aside = ((offset**2).sum(-1) - along**2).clamp(min=0)
     squared = (along**2 + 0.1 * aside) / noise**2
-    robust = _DOUBT**2 * torch.log1p(squared / _DOUBT**2)
-    return weight * robust
+    return weight * _cauchy(squared, DEPTH_DOUBT)
 
 
 def vertex_normals_torch(
@@ -202,8 +212,7 @@ def free_space_loss(
     Returns:
         Sum over keypoints and views, mean over frames, in units of the noise, squared.
     """
-    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
-    projected = torch.einsum("vij,fkj->vfki", space.projection, homogeneous)
+    projected = _projected(point, space.projection)
     depth = projected[..., 2]
     with torch.no_grad():
         pixel = projected[..., :2] / depth[..., None].clamp(min=1e-3)
@@ -216,4 +225,4 @@ def free_space_loss(
         is_known &= (measured > 0) & (measured - depth < _EDGE)
     before = torch.where(is_known, measured + _SKIN - depth, 0.0).relu()
     squared = before**2 / noise**2
-    return (_DOUBT**2 * torch.log1p(squared / _DOUBT**2)).sum() / point.shape[0]
+    return _cauchy(squared, DEPTH_DOUBT).sum() / point.shape[0]

@@ -14,7 +14,7 @@ from physhandi.data.observation import evenly
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.hand.names import HandSide
-from physhandi.perception.lifting import HAND_LABEL, surface_points
+from physhandi.perception.lifting import HAND_LABEL, pixel_values, surface_points
 from physhandi.perception.segmentation import draw_hand
 
 _GRID = 64
@@ -203,30 +203,10 @@ def free_space(views: Many[View], target: KeypointTarget) -> FreeSpace:
             step[number, frame] = (1 + 2 * _MARGIN) * extent / (_GRID - 1)
             at = np.stack(np.meshgrid(np.arange(_GRID), np.arange(_GRID)), axis=-1)
             pixel = corner[number, frame] + step[number, frame] * at
-            depth[number, frame] = _sampled(view.depth(frame), _as_recorded(view.camera, pixel))
+            depth[number, frame] = pixel_values(view.depth(frame), view.camera.distort(pixel))
     return FreeSpace(
         depth=torch.tensor(depth),
         corner=torch.tensor(corner, dtype=torch.float32),
         step=torch.tensor(step, dtype=torch.float32),
         projection=target.projection,
     )
-
-
-def _as_recorded(
-    camera: PinholeCamera, pixel: Float[ndarray, "*batch 2"]
-) -> Float[ndarray, "*batch 2"]:
-    """Find where the camera recorded what a lens without distortion sees at a pixel [px]."""
-    ray = (pixel - camera.K[:2, 2]) @ np.linalg.inv(camera.K[:2, :2]).T
-    point = np.concatenate([ray, np.ones_like(ray[..., :1])], axis=-1)
-    pose = camera.T_world_camera
-    return camera.project(point @ pose[:3, :3].T + pose[:3, 3])
-
-
-def _sampled(
-    depth: Float[ndarray, "row column"], pixel: Float[ndarray, "*batch 2"]
-) -> Float[ndarray, "*batch"]:
-    """Read depth at the nearest pixels; zero outside of the image [m]."""
-    column, row = np.moveaxis(np.round(pixel).astype(np.int64), -1, 0)
-    height, width = depth.shape
-    is_inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    return np.where(is_inside, depth[row.clip(0, height - 1), column.clip(0, width - 1)], 0.0)

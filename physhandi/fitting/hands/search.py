@@ -5,7 +5,6 @@ measured surface cannot bring it back. So a pose is fitted to keypoints and dept
 frames, from several starts each; of what comes out, a chain over the frames is chosen.
 """
 
-import math
 from collections.abc import Callable
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, replace
@@ -16,7 +15,6 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from physhandi.adam import Adam
 from physhandi.data.camera import PinholeCamera
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.hands.losses import (
@@ -25,12 +23,16 @@ from physhandi.fitting.hands.losses import (
     distance_costs,
     keypoint_costs,
     limit_costs,
-    vertex_normals_torch,
 )
 from physhandi.fitting.hands.observed import DepthTarget, KeypointTarget
+from physhandi.fitting.hands.poses import (
+    PosedHands,
+    doubt_breadth,
+    hand_optimizer,
+    step_share,
+)
 from physhandi.fitting.hands.wrist_guess import WristGuess, bridge, mirrored_pose, ways_to_depth
 from physhandi.hand.model import HandModel
-from physhandi.hand.rotation import quaternion_matrix
 
 _BENDS = (-0.1, -0.8, -1.4)
 """Angles by which every joint of the fingers is bent in the starts [rad]."""
@@ -137,6 +139,7 @@ class _Starts:
             "rotation": torch.tensor(rotation, dtype=torch.float32),
             "translation": torch.tensor(translation, dtype=torch.float32),
         }
+        self._hands = PosedHands(hand.model, self.parameters)
         rows = torch.from_numpy(frames).repeat_interleave(2 * len(_BENDS))
         seen, depth = hand.target, hand.depth
         self._target = replace(seen, pixel=seen.pixel[:, rows], weight=seen.weight[:, rows])
@@ -144,60 +147,35 @@ class _Starts:
         self._depth = DepthTarget(point, ray, weight)
         self._way = torch.nn.functional.normalize(ray.sum(1, keepdim=True), dim=-1)
         self._place()
-        share = {"shape": 2.0, "articulation": 1.0, "rotation": 0.3, "translation": 0.1}
-        self._optimizer = Adam(
-            [
-                (self.parameters[name].requires_grad_(), _RATE * part)
-                for name, part in share.items()
-            ],
-            betas=(0.9, 0.99),
-        )
+        self._optimizer = hand_optimizer(self.parameters, _RATE)
 
     def update(self, iteration: int) -> Tensor:
         """Descend once; returns the loss before that."""
-        config, share = self._config, iteration / self._config.search_iterations
+        config, iterations = self._config, self._config.search_iterations
         if iteration % REFRESH == 0:
             self._look()
         self._optimizer.zero_grad()
-        cost = self._costs(config.doubt * 10 ** (1 - min(share / 0.6, 1.0)))
+        cost = self._costs(doubt_breadth(config.doubt, iteration, iterations))
         shape = self.parameters["shape"]
         loss = cost.sum() / self._frame_count + config.shape_weight * (shape**2).sum()
         loss.backward()
-        self._optimizer.step(0.05 + 0.475 * (1 + math.cos(math.pi * share)))
+        self._optimizer.step(step_share(iteration, iterations))
         return loss.detach()
 
     @torch.no_grad()
     def outcome(self) -> tuple[Float[ndarray, "frame start"], Float[ndarray, "frame start 21 3"]]:
         """Compute what each hand costs now, and its keypoints [m]."""
         self._look()
-        cost, point = self._costs(self._config.doubt), self._keypoints()
+        cost, point = self._costs(self._config.doubt), self._hands.keypoints()
         parts = (self._frame_count, -1)
         return cost.unflatten(0, parts).double().numpy(), point.unflatten(0, parts).numpy()
-
-    def _shape(self) -> Tensor:
-        return 3 * torch.tanh(self.parameters["shape"] / 3)
-
-    def _in_world(self, point: Float[Tensor, "hand point 3"]) -> Float[Tensor, "hand point 3"]:
-        turn = quaternion_matrix(self.parameters["rotation"])
-        return point @ turn.transpose(-1, -2) + self.parameters["translation"][:, None]
-
-    def _keypoints(self) -> Float[Tensor, "hand 21 3"]:
-        articulation = self.parameters["articulation"]
-        still = torch.zeros_like(self.parameters["translation"])
-        return self._in_world(self._model.keypoints(self._shape(), articulation, still, still))
-
-    def _surface(self) -> tuple[Float[Tensor, "hand vertex 3"], Float[Tensor, "hand vertex 3"]]:
-        """Pose the surfaces of all hands; returns vertices [m] and normals."""
-        still = torch.zeros_like(self.parameters["translation"])
-        pose = self._model(self._shape(), self.parameters["articulation"], still, still)
-        vertex = self._in_world(pose.vertex)
-        return vertex, vertex_normals_torch(vertex, torch.from_numpy(self._model.faces))
 
     @torch.no_grad()
     def _place(self) -> None:
         """Move each palm along the view to where depth was measured, as with half bent fingers."""
         half = slice(len(_BENDS) // 2, None, len(_BENDS))
-        vertex, normal = (part[half].numpy() for part in self._surface())
+        surface = self._hands.surface()
+        vertex, normal = surface[half].numpy(), self._hands.normals(surface)[half].numpy()
         depth = self._depth
         target = DepthTarget(depth.point[half], depth.towards_camera[half], depth.weight[half])
         way = np.nan_to_num(ways_to_depth(vertex, normal, target)).repeat(len(_BENDS), axis=0)
@@ -206,8 +184,8 @@ class _Starts:
     @torch.no_grad()
     def _look(self) -> None:
         """Look for the vertices that measured points correspond to."""
-        vertex, normal = self._surface()
-        target = self._depth
+        vertex, target = self._hands.surface(), self._depth
+        normal = self._hands.normals(vertex)
         shortened = replace(target, point=self._shortened(target.point))
         target.vertex = correspond(self._shortened(vertex), normal, shortened)
         target.normal = normal.gather(1, target.vertex[..., None].expand(-1, -1, 3))
@@ -223,11 +201,10 @@ class _Starts:
         assert target.vertex is not None  # noqa: S101 - `_look` comes first
         assert target.normal is not None  # noqa: S101
         articulation = self.parameters["articulation"]
-        vertex = self._model.chosen_vertices(target.vertex, self._shape(), articulation)
-        offset = target.point - self._in_world(vertex)
+        offset = target.point - self._hands.vertices(target.vertex)
         far = distance_costs(offset, target.normal, target.weight, config.depth_noise)
         return (
-            keypoint_costs(self._keypoints(), self._target, breadth).sum((0, 2))
+            keypoint_costs(self._hands.keypoints(), self._target, breadth).sum((0, 2))
             + config.depth_weight * far.sum(1)
             + config.limit_weight * limit_costs(articulation, self._model).sum((1, 2))
             + config.pose_weight * (articulation**2).sum((1, 2))

@@ -58,6 +58,7 @@ def test_undistort_moves_a_pixel_to_the_pinhole_image() -> None:
     straight = make_camera().project(point)
     assert np.abs(camera.project(point) - straight).max() > 3.0
     assert camera.undistort(camera.project(point)) == pytest.approx(straight, abs=1e-7)
+    assert camera.distort(straight) == pytest.approx(camera.project(point), abs=1e-9)
 
 
 def test_points_behind_the_camera_have_no_pixel() -> None:
