@@ -13,22 +13,19 @@ PIP_FLAGS := --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 install: $(STAMP)
 
-# A newer pip than a fresh environment has needs half the time. It leaves compiling to the first
-# import: of all modules that are installed few are used. One pip keeps less than one processor busy,
-# so six install what the second part of constraints.txt names, each its own packages, and the project
-# itself, which is built meanwhile; the last looks for what these have left out.
+# uv takes a tenth of pip's processor time for what constraints.txt names; PyTorch, which has a build for
+# each kind of machine, comes from where pip is told to look, beside it. Nothing is compiled: of all
+# modules that are installed few are used. Where uv finds no packages pip installs them at the end.
 export PYTHONDONTWRITEBYTECODE :=
+EXTRAS := [dev,synth,capture,models,newton,usd]
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install $(PIP_FLAGS) --upgrade pip
-	sed '1,/^# What else/d; /^# Other/,$$d' constraints.txt >$(VENV)/packages
-	for part in 0 1 2 3; do awk "NR % 4 == $$part" $(VENV)/packages >$(VENV)/packages.$$part; done
-	processes=; \
-	for packages in $(TORCH) "--no-deps -r $(VENV)/packages.0" "--no-deps -r $(VENV)/packages.1" \
-	  "--no-deps -r $(VENV)/packages.2" "--no-deps -r $(VENV)/packages.3" "--no-deps -e ."; do \
-	  $(BIN)/python -m pip install $(PIP_FLAGS) $$packages & processes="$$processes $$!"; done; \
-	for process in $$processes; do wait $$process || exit; done
-	$(BIN)/python -m pip install $(PIP_FLAGS) "physhandi[dev,synth,capture,models,newton,usd]"
+	sed '/^torch==/d; /^# Other/,$$d' constraints.txt >$(VENV)/packages
+	index="$${PIP_INDEX_URL:-$$($(BIN)/python -m pip config get global.index-url 2>/dev/null)}"; \
+	uv="$(BIN)/uv pip install --quiet $${index:+--default-index $$index} -c constraints.txt"; \
+	{ $(BIN)/python -m pip install $(PIP_FLAGS) uv && $$uv --no-deps -r $(VENV)/packages -e .; } & \
+	$(BIN)/python -m pip install $(PIP_FLAGS) --no-deps $(TORCH) && wait && \
+	{ $$uv "physhandi$(EXTRAS)" || $(BIN)/python -m pip install $(PIP_FLAGS) -e ".$(EXTRAS)"; }
 	touch $@
 
 demo: install

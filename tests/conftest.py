@@ -17,8 +17,9 @@ from recordings import recording
 BROWSERS = ("tests/e2e/", "tests/app/benchmarks/test_viewer_benchmark.py")
 """Files whose tests start browsers."""
 
-CHECKED_CALLS = 1_000
-"""Calls of each function, in each process, whose arguments and results have shapes checked."""
+CHECKED_FIRST, CHECKED_EVERY = 20, 64
+"""Calls of each function, in each process, whose arguments and results have shapes checked: the
+first 20, and then each 64th."""
 
 
 def pytest_configure(config):
@@ -33,11 +34,11 @@ def pytest_configure(config):
     os.fsync = lambda _descriptor: None
     # When all is over, nothing is gained by a search for garbage.
     atexit.register(gc.freeze)
-    jaxtyping.jaxtyped = _checked_at_first(jaxtyping.jaxtyped)
+    jaxtyping.jaxtyped = _checked_at_times(jaxtyping.jaxtyped)
 
 
-def _checked_at_first(jaxtyped):
-    """Check shapes in a function's first calls: fits call some a hundred thousand times.
+def _checked_at_times(jaxtyped):
+    """Check shapes in some of a function's calls: fits call some a hundred thousand times.
 
     What checks them is made at the first call, since most functions are called by few tests.
     """
@@ -52,8 +53,9 @@ def _checked_at_first(jaxtyped):
 
         @functools.wraps(function)
         def call(*args, **kwargs):
-            chosen = checked() if next(calls) < CHECKED_CALLS else function
-            return chosen(*args, **kwargs)
+            number = next(calls)
+            is_checked = number < CHECKED_FIRST or number % CHECKED_EVERY == 0
+            return (checked() if is_checked else function)(*args, **kwargs)
 
         return call
 
