@@ -579,6 +579,10 @@ def _problems(
         control = artefacts.load_control(attempt.out, sequence.name)
         contacts = None
         if follows_contact:
+            ground = None
+            if sequence.ground_height is not None:
+                lift = np.zeros(len(object_node)) if clearance is None else clearance
+                ground = sequence.ground_height + lift
             contacts = find_contacts(
                 observation,
                 object_node,
@@ -587,6 +591,8 @@ def _problems(
                 frame_rate=sequence.frame_rate,
                 kind=kind,
                 most_grips=config.object_.most_grips,
+                ground=ground,
+                gravity=sequence.gravity,
             )
         problems.append(
             build_problem(

@@ -4,6 +4,9 @@ A place of the object that is held stays where it is, seen from the hand; past a
 leaves, hovers or slides it moves. So each node near a hand is followed in the frame of the hand's
 surface beside it: as long as it stays within a tolerance, the two are in contact.
 
+Where no contact is found so, but what is near a hand stays in the air, the hand holds it all the
+same.
+
 Of frames after those that are fitted, only the hands are read: what holds in the last fitted frame
 goes on holding, until the hand opens.
 """
@@ -59,6 +62,9 @@ OPENING = 0.75
 EVIDENCE, FARTHER = 3.0, 2.0
 """Longest way from a node to the nearest track that tells its motion, in distances of nodes, or in
 what it is at frame 0 if that is more. Where all are farther away, what holds a node is not told."""
+FOLLOWS, OF_FALL = 2.0, 0.5
+"""How far one may move, seen from the hand, that would fall if the hand did not hold it: so many
+times as far as a node in contact, and at most this part of its fall."""
 MOST_PAIRS = 80
 """Most pairs of a control node at a time."""
 
@@ -93,6 +99,8 @@ def find_contacts(
     frame_rate: float,
     kind: ShapeClass | None = None,
     most_grips: int | None = None,
+    ground: Float[ndarray, " node"] | None = None,
+    gravity: float = 0.0,
 ) -> ContactIntervals:
     """Find what hands hold, and when, in the frames that are fitted.
 
@@ -104,20 +112,15 @@ def find_contacts(
         frame_rate: Frames a second [Hz].
         kind: Kind of the object; None if it is not known.
         most_grips: Most control nodes, the nearest ones, that hold a node at a time; None for all.
+        ground: Height at which each node lies on the ground [m]; None without ground.
+        gravity: Acceleration along -z [m/s²]; without it nothing needs to be held.
 
     Returns:
         The contacts; a node's distance from each control node is that of the frame in which its
         contact begins. One that holds in the last fitted frame lasts until the hand opens.
     """
     if control.shape[1] == 0:
-        nothing = np.zeros(0, np.int32)
-        return ContactIntervals(
-            node=nothing,
-            control=nothing,
-            distance=np.zeros(0, np.float32),
-            rank=nothing,
-            interval=np.zeros((0, 2), np.int32),
-        )
+        return _pairs([], control, control, 0.0, most_grips)
     start = np.asarray(node, dtype=np.float64)
     spacing = node_distance(start)
     hands = _hands(np.asarray(control[:frame_count], np.float64), SURFACE * spacing)
@@ -147,17 +150,47 @@ def find_contacts(
             )
         ]
     last = frame_count - 1
+    shown = np.take_along_axis(seen, last_told[..., None], axis=0)
+    height = shown[..., 2] - (-np.inf if ground is None else ground)
+    if kind in {"solid", "shell"}:  # It stands if one of its nodes does.
+        height = np.broadcast_to(height.min(axis=1, keepdims=True), height.shape)
+    for begin, end in _runs_without(held, last):
+        fall = np.minimum(0.5 * gravity * ((end - begin) / frame_rate) ** 2, height[end])
+        index = _follower(hands, shown, (begin, end), fall, LONGEST_HOLD * reach, spacing)
+        held += [] if index is None else [(index, begin, end)]
     holding = np.unique([nearest[last, index] for index, _, end in held if end == last]).astype(int)
     until = _openings(np.asarray(control, np.float64), holding, last, window, spacing)
+    held = [
+        (index, begin, end if end < last else until[int(nearest[last, index])])
+        for index, begin, end in held
+    ]
+    return _pairs(held, shown, hands.control, LONGEST_HOLD * reach, most_grips)
+
+
+def _pairs(
+    held: list[tuple[int, int, int]],
+    seen: Float[ndarray, "frame node 3"],
+    control: Float[ndarray, "frame control 3"],
+    farthest: float,
+    most_grips: int | None,
+) -> ContactIntervals:
+    """Pair nodes that are held with what is near them when the contact begins.
+
+    Args:
+        held: Node, first and last frame of each contact.
+        seen: Places of the nodes [m].
+        control: Control nodes [m].
+        farthest: Longest distance of a pair [m].
+        most_grips: Most control nodes, the nearest ones, of a contact; None for all.
+    """
     pairs: list[ndarray] = []
     for index, begin, end in held:
-        away = np.linalg.norm(hands.control[begin] - seen[begin, index], axis=1)
-        near_by = np.flatnonzero(away < LONGEST_HOLD * reach)
+        away = np.linalg.norm(control[begin] - seen[begin, index], axis=1)
+        near_by = np.flatnonzero(away < farthest)
         if most_grips is not None:
             nearest_first = np.argsort(away[near_by], kind="stable")
             near_by = np.sort(near_by[nearest_first[:most_grips]])
-        leaves = end if end < last else until[int(nearest[last, index])]
-        row = np.broadcast_to(np.array([index, begin, leaves]), (len(near_by), 3))
+        row = np.broadcast_to(np.array([index, begin, end]), (len(near_by), 3))
         pairs.append(np.column_stack([near_by, away[near_by], row]))
     table = np.concatenate(pairs) if pairs else np.zeros((0, 5))
     interval = table[:, 3:].astype(np.int64)
@@ -298,6 +331,48 @@ def _contacts_of(
         if begin < end:
             found.append((begin, end))
     return sorted(found)
+
+
+def _runs_without(held: list[tuple[int, int, int]], last: int) -> list[tuple[int, int]]:
+    """Give first and last frame of the stretches of time in which hands hold nothing."""
+    is_held = np.zeros(last, bool)
+    for _, begin, end in held:
+        is_held[begin:end] = True
+    edge = np.flatnonzero(np.diff(np.concatenate([[True], is_held, [True]]).astype(int)))
+    return [(int(begin), int(end)) for begin, end in edge.reshape(-1, 2)]
+
+
+def _follower(  # noqa: PLR0917  (who moves, and what bounds it)
+    hands: _Hands,
+    seen: Float[ndarray, "frame node 3"],
+    stretch: tuple[int, int],
+    fall: Float[ndarray, " node"],
+    farthest: float,
+    spacing: float,
+) -> int | None:
+    """Find the node that goes with a hand where it would fall if the hand did not hold it.
+
+    Args:
+        hands: The hands.
+        seen: Places of the nodes [m].
+        stretch: First and last frame of a time in which nothing is held.
+        fall: How far each node would fall in that time [m].
+        farthest: Longest distance from the hand at first [m].
+        spacing: Distance of nodes [m].
+
+    Returns:
+        The nearest of these; None if all lie on the ground or leave the hand.
+    """
+    begin, end = stretch
+    distance, nearest = KDTree(hands.control[begin]).query(seen[begin])
+    way = SLIP * spacing + GIVE * distance
+    candidate = np.flatnonzero((distance < farthest) & (fall > way))
+    for index in candidate[np.argsort(distance[candidate], kind="stable")]:
+        local = hands.seen_from(seen[:, index], nearest[index : index + 1])[0, begin : end + 1]
+        moved = np.linalg.norm(local - local[0], axis=1).max()
+        if moved < min(FOLLOWS * way[index], OF_FALL * fall[index]):
+            return int(index)
+    return None
 
 
 def _openings(

@@ -284,3 +284,64 @@ def test_what_no_frame_shows_from_near_is_told_by_what_is_nearest() -> None:
     ((begin, end),) = at(found(hidden, hand(ABOVE + way + leaving)), MIDDLE)
     assert begin == 0
     assert 22 <= end <= 24
+
+
+BELOW = np.full(len(SHEET), -0.3)
+"""Ground far below the sheet."""
+
+
+def held_steps(contacts: ContactIntervals, frames: int = FRAMES) -> list[int]:
+    """Frames from each of which a hand holds something until the next one."""
+    steps = np.arange(frames - 1)[:, None]
+    return np.flatnonzero(
+        ((contacts.interval[:, 0] <= steps) & (steps < contacts.interval[:, 1])).any(axis=1)
+    ).tolist()
+
+
+def test_what_stays_in_the_air_beside_a_hand_is_held() -> None:
+    """A hand that is found 18 mm above the sheet from frame 12 to 24: too far to hold it."""
+    away = np.zeros((FRAMES, 3))
+    away[12:25, 2] = 0.015
+    way = along(0, ramp(5, 35, 0.06))
+    control = hand(ABOVE + way + away)
+    every = list(range(FRAMES - 1))
+
+    def steps_held(what: ObjectObservation | None = None, **options: object) -> list[int]:
+        fields = {"frame_count": FRAMES, "frame_rate": RATE, "gravity": 9.81} | options
+        return held_steps(find_contacts(what or seen(way), SHEET, control, **fields))
+
+    left_alone = steps_held(ground=BELOW, gravity=0.0)
+    assert {*every} - {*left_alone} >= {*range(13, 23)}
+    assert steps_held(ground=BELOW) == every
+    assert steps_held() == every  # There is no ground.
+    # It lies on the ground, or would lie there after less than the way by which held nodes move.
+    assert steps_held(ground=SHEET[:, 2]) == left_alone
+    assert steps_held(ground=SHEET[:, 2] - 0.009) == left_alone
+    # A solid stands if one of its nodes does; a sheet hangs down from where it is held.
+    one_stands = np.where(np.arange(len(SHEET)) == 0, 0.0, BELOW)
+    assert steps_held(ground=one_stands, kind="sheet") == every
+    assert steps_held(ground=one_stands, kind="solid") == left_alone
+    assert steps_held(ground=BELOW, kind="solid") == every
+    # It falls while nothing holds it, and is caught.
+    fall = np.zeros((FRAMES, 3))
+    fall[12:25, 2] = -0.5 * 9.81 * (np.arange(13) / RATE) ** 2
+    fall[25:, 2] = fall[24, 2]
+    control = hand(ABOVE + way + away + fall * (np.arange(FRAMES) >= 25)[:, None])
+    assert 20 not in steps_held(seen(way + fall), ground=BELOW)
+
+
+def test_a_hand_that_is_found_beside_what_it_lifts_holds_the_nearest_node() -> None:
+    way = along(2, ramp(5, 35, 0.1))
+    aside = SHEET[MIDDLE] + [0.0, 0.0, 0.018]
+    fields = {"frame_count": FRAMES, "frame_rate": RATE, "ground": SHEET[:, 2]}
+    assert len(find_contacts(seen(way), SHEET, hand(aside + way), **fields).node) == 0
+    contacts = find_contacts(seen(way), SHEET, hand(aside + way), **fields, gravity=9.81)
+    near = np.linalg.norm(SHEET[:, None] - (aside + PALM)[None], axis=2)
+    assert np.unique(contacts.interval, axis=0).tolist() == [[0, NEVER]]
+    (node,) = np.unique(contacts.node)
+    assert near[node].min() == pytest.approx(0.018)
+    np.testing.assert_allclose(contacts.distance, near[node, contacts.control], rtol=1e-6)
+    # A hand that stays where it is while the sheet rises lifts nothing.
+    beside = SHEET[4] - [0.012 + 0.018, 0.0, 0.0]
+    still = hand(np.broadcast_to(beside, (FRAMES, 3)))
+    assert len(find_contacts(seen(way), SHEET, still, **fields, gravity=9.81).node) == 0
