@@ -82,6 +82,9 @@ class HandFitConfig(Settings, frozen=True, kw_only=True):
     fixed_normals: bool = True
     """Whether the hand's normals stay as they are between two searches for the vertices that
     measured points correspond to. Only these vertices are computed then, which is much faster."""
+    judges_keypoints: bool = True
+    """Whether keypoints lose their weight that contradict what other views triangulate, and all of
+    a view's keypoints of a hand if most of them do."""
     keypoint_noise: Annotated[float, Meta(ge=1e-4, le=1.0)] = 0.015
     """Error to be expected of a keypoint, as a share of the hand's size in the image."""
     doubt: Annotated[float, Meta(ge=0.1, le=1e3)] = 3.0

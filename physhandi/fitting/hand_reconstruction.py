@@ -24,6 +24,8 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.checks.readiness import REMEDIES, missing_for_hands
 from physhandi.fitting.config import HandFitConfig
+from physhandi.fitting.hands.agreement import believed_keypoints
+from physhandi.fitting.hands.left_right import hands_in_place
 from physhandi.fitting.hands.losses import (
     DEPTH_DOUBT,
     REFRESH,
@@ -51,7 +53,12 @@ from physhandi.fitting.hands.poses import (
     step_share,
 )
 from physhandi.fitting.hands.search import SearchedHand, search_hand
-from physhandi.fitting.hands.wrist_guess import WristGuess, guess_wrist, way_to_depth
+from physhandi.fitting.hands.wrist_guess import (
+    WristGuess,
+    guess_wrist,
+    template_keypoints,
+    way_to_depth,
+)
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion
@@ -73,7 +80,7 @@ class HandFit:
     motions: tuple[HandMotion, ...]
     """Motion of each hand that was found, in the order of the sequence's hands."""
     keypoint: Float[ndarray, "view frame hand 21 3"]
-    """Keypoints that the hands were fitted to; NaN where not seen [px]."""
+    """Keypoints that were seen, those included that were not believed; NaN where not seen [px]."""
     loss_before: float
     """Loss of the first guess, without depth."""
     loss_after: float
@@ -120,10 +127,14 @@ def reconstruct_hands(
         )
     if keypoint is None:
         keypoint = observed_keypoints(sequence, progress)
+    models = [load_hand_model(side, config.model) for side in sequence.hands]
+    if config.judges_keypoints and len(models) == 2:
+        cameras = [view.camera for view in sequence.views]
+        templates = [template_keypoints(model) for model in models]
+        keypoint = hands_in_place(cameras, keypoint, templates)
     fits: list[SolvedHand] = []
     left_out: dict[HandSide, str] = {}
-    for hand, side in enumerate(sequence.hands):
-        model = load_hand_model(side, config.model)
+    for hand, (side, model) in enumerate(zip(sequence.hands, models, strict=True)):
         try:
             problem = HandProblem(sequence, keypoint[:, :, hand], model, config)
         except FitError as error:
@@ -185,6 +196,10 @@ class HandProblem:
     ) -> None:
         self.model, self.config, self.metric = model, config, sequence.metric
         cameras: list[PinholeCamera] = [view.camera for view in sequence.views]
+        if config.judges_keypoints:
+            keypoint = believed_keypoints(
+                sequence.views, keypoint, template_keypoints(model), sequence.frame_rate
+            )
         self.target: KeypointTarget = keypoint_target(cameras, keypoint, config.keypoint_noise)
         tolerance = config.agreement * float(self.target.noise.max())
         self.depth: DepthTarget | None = None

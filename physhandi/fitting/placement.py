@@ -25,7 +25,9 @@ from physhandi.fitting import artefacts
 from physhandi.fitting.config import PipelineConfig
 from physhandi.fitting.hand_reconstruction import HandFit, reconstruct_hands
 from physhandi.fitting.hand_refinement import RefinedHands, RefinementProblem, refine_hands
+from physhandi.fitting.hands.agreement import believed_keypoints
 from physhandi.fitting.hands.observed import keypoint_target
+from physhandi.fitting.hands.wrist_guess import template_keypoints
 from physhandi.fitting.object_problem import ObjectProblem, initial_velocity
 from physhandi.fitting.rest_state import hold_still, rest_in_place, resting_clearance
 from physhandi.fitting.rope.bending import gripped
@@ -315,12 +317,8 @@ def refine_sequence(
             hand_models=models,
             chosen=_chosen_vertices(sequence, vertex[0], models, config),
             targets=tuple(
-                keypoint_target(
-                    cameras,
-                    fitted_keypoint[:, :, sequence.hands.index(motion.side)],
-                    config.hand.keypoint_noise,
-                )
-                for motion in motions
+                keypoint_target(cameras, seen, config.hand.keypoint_noise)
+                for seen in _keypoints_of_hands(sequence, fitted_keypoint, models, config)
             ),
         ),
         config.refinement,
@@ -328,6 +326,22 @@ def refine_sequence(
         device=device,
         checkpointer=checkpointer,
     )
+
+
+def _keypoints_of_hands(
+    sequence: Sequence,
+    keypoint: Float[ndarray, "view frame hand 21 3"],
+    models: Listing[HandModel],
+    config: PipelineConfig,
+) -> list[Float[ndarray, "view frame 21 3"]]:
+    """Take out each hand's keypoints, as far as stage 1 believed them."""
+    seen = [keypoint[:, :, sequence.hands.index(model.side)] for model in models]
+    if not config.hand.judges_keypoints:
+        return seen
+    return [
+        believed_keypoints(sequence.views, one, template_keypoints(model), sequence.frame_rate)
+        for one, model in zip(seen, models, strict=True)
+    ]
 
 
 def store_refined(

@@ -92,7 +92,7 @@ def keypoint_target(
     filled = np.where(is_seen[..., None], keypoint, 0.0).astype(np.float64)
     pixel = np.stack([c.undistort(k[..., :2]) for c, k in zip(cameras, filled, strict=True)])
     projection = np.stack([camera.K @ camera.T_camera_world[:3] for camera in cameras])
-    noise = np.maximum(relative_noise * np.array([_hand_size(view) for view in keypoint]), 0.5)
+    noise = np.maximum(relative_noise * np.array([hand_size(view) for view in keypoint]), 0.5)
     return KeypointTarget(
         pixel=torch.tensor(pixel, dtype=torch.float32),
         weight=torch.tensor(filled[..., 2] * is_seen, dtype=torch.float32),
@@ -101,7 +101,7 @@ def keypoint_target(
     )
 
 
-def _hand_size(keypoint: Float[ndarray, "frame 21 3"]) -> float:
+def hand_size(keypoint: Float[ndarray, "frame 21 3"]) -> float:
     """Compute the median diagonal of the keypoints' bounding box in one view [px]."""
     is_whole = np.isfinite(keypoint).all(-1).sum(1) >= 15
     if not is_whole.any():

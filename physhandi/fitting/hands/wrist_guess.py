@@ -71,7 +71,7 @@ def guess_wrist(
     Raises:
         FitError: If no frame shows enough of the palm.
     """
-    template = _template(model)
+    template = template_keypoints(model)
     view_count, frame_count = keypoint.shape[:2]
     flat = keypoint.reshape(view_count, -1, 3)
     weight = np.nan_to_num(flat[..., 2])
@@ -83,7 +83,7 @@ def guess_wrist(
     for frame in range(frame_count):
         is_seen = np.isfinite(point[frame, palm]).all(-1)
         if is_seen.sum() >= LEAST_PALM_POINTS:
-            pose = _align(template[palm][is_seen], point[frame, palm][is_seen] / scale)
+            pose = align(template[palm][is_seen], point[frame, palm][is_seen] / scale)
             rotation[frame], translation[frame] = pose[0].as_quat(), pose[1]
             is_known[frame] = True
     from_one_view = not is_known.any()
@@ -103,7 +103,8 @@ def guess_wrist(
     return WristGuess(rotation, translation, scale, is_known, from_one_view)
 
 
-def _template(model: HandModel) -> Float[ndarray, "21 3"]:
+def template_keypoints(model: HandModel) -> Float[ndarray, "21 3"]:
+    """Pose the keypoints of a hand of mean shape at rest [m]."""
     zero = torch.zeros(1, 3, dtype=torch.float64)
     keypoint = model.keypoints(zero.new_zeros(10), zero.new_zeros(1, 15, 3), zero, zero)
     return keypoint[0].numpy()
@@ -120,7 +121,7 @@ def _scale(point: Float[ndarray, "frame 21 3"], template: Float[ndarray, "21 3"]
     return float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 1.0
 
 
-def _align(
+def align(
     source: Float[ndarray, "point 3"], target: Float[ndarray, "point 3"]
 ) -> tuple[Rotation, Float[ndarray, " 3"]]:
     """Find the rigid motion that takes one set of points closest to another (Kabsch)."""
@@ -163,12 +164,12 @@ def mirrored_pose(
 ) -> WristPose:
     """Mirror a palm in depth: it is flat, so the view that sees it best shows it about as well."""
     palm = list(PALM)
-    template, camera = _template(model)[palm], cameras[_clearest_view(keypoint[:, palm])]
+    template, camera = template_keypoints(model)[palm], cameras[_clearest_view(keypoint[:, palm])]
     point = pose[0].apply(template) + pose[1]
     way = point.mean(axis=0) - camera.T_world_camera[:3, 3]
     way /= np.linalg.norm(way)
     along = (point - point.mean(axis=0)) @ way
-    return _align(template, point - 2 * along[:, None] * way)
+    return align(template, point - 2 * along[:, None] * way)
 
 
 def _clearest_view(keypoint: Float[ndarray, "view point 3"]) -> int:
