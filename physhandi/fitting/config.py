@@ -85,6 +85,9 @@ class HandFitConfig(Settings, frozen=True, kw_only=True):
     judges_keypoints: bool = True
     """Whether keypoints lose their weight that contradict what other views triangulate, and all of
     a view's keypoints of a hand if most of them do."""
+    smooths_motion: bool = False
+    """Whether the motion is smoothed in the end, as far as its keypoints allow: what they err by
+    from frame to frame shakes what the hand holds."""
     keypoint_noise: Annotated[float, Meta(ge=1e-4, le=1.0)] = 0.015
     """Error to be expected of a keypoint, as a share of the hand's size in the image."""
     doubt: Annotated[float, Meta(ge=0.1, le=1e3)] = 3.0
@@ -703,8 +706,16 @@ def values_of(config: PipelineConfig) -> dict[str, Any]:
     return values
 
 
+_LATER_INTERVALS = {("quick", "friction"): ("hand", "smooths_motion")}
+"""Intervals that a profile has got since runs were made with it, each with a setting, by its group
+and name, that came at the same time: a run that is without that is older."""
+
+
 def without_newer(config: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Drop the settings of a configuration that a stored one was made without, in plain data."""
+    """Drop the settings of a configuration that a stored one was made without, in plain data.
+
+    A searched parameter is a choice and stays, unless its profile got it only later.
+    """
 
     def inside(kind: type[Settings], own: Mapping[str, Any], then: Mapping[str, Any]) -> Any:
         entries = {entry.name: entry for entry in fields_of(kind)}
@@ -720,8 +731,17 @@ def without_newer(config: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[
         if entry.kind == "settings":
             return inside(entry.inner, own, then)
         return {
-            key: inside(entry.inner, v, then[key]) if key in then else v for key, v in own.items()
+            key: inside(entry.inner, v, then[key]) if key in then else v
+            for key, v in own.items()
+            if key in then or not is_later(key, v)
         }
+
+    def is_later(name: str, interval: Any) -> bool:
+        group, setting = _LATER_INTERVALS.get((config["profile"], name), ("", ""))
+        if not setting or setting in stored.get(group, {}):
+            return False
+        shipped = named_profile(config["profile"]).object_.search.variables
+        return interval == shipped[name].to_dict()
 
     return inside(PipelineConfig, config, stored)
 

@@ -2,8 +2,8 @@
 
 `reconstruct_hands` fits one hand after the other: `guess_wrist` places the palm in every frame,
 then `HandProblem` refines pose and shape by gradient descent, first on the keypoints, then on
-keypoints and depth. Where one view alone places the palm, and depth was measured, `search_hand`
-takes the place of the fit to keypoints.
+keypoints and depth; its motion may be smoothed in the end. Where one view alone places the palm,
+and depth was measured, `search_hand` takes the place of the fit to keypoints.
 """
 
 import math
@@ -34,6 +34,7 @@ from physhandi.fitting.hands.losses import (
     distance_loss,
     free_space_loss,
     hand_acceleration_loss,
+    keypoint_costs,
     limit_loss,
     reprojection_loss,
     velocity_loss,
@@ -53,6 +54,7 @@ from physhandi.fitting.hands.poses import (
     step_share,
 )
 from physhandi.fitting.hands.search import SearchedHand, search_hand
+from physhandi.fitting.hands.smoothing import best_strength, smoothed_pose
 from physhandi.fitting.hands.wrist_guess import (
     WristGuess,
     guess_wrist,
@@ -323,6 +325,10 @@ class HandProblem:
             raise FitError(
                 f"The fit of the {self.model.side} hand did not stay finite (loss {after})."
             )
+        if config.smooths_motion:
+            with torch.no_grad(), one_thread():
+                self._smooth()
+                after = float(self.loss(config.doubt))
         return SolvedHand(self._motion(), before, after, curve)
 
     def _first_iterations(self) -> int:
@@ -364,6 +370,21 @@ class HandProblem:
                 first=first,
                 resumed=resumed,
             )
+
+    def _smooth(self) -> None:
+        """Smooth the motion as far as the keypoints allow."""
+        fitted, target = dict(self.parameters), self.target
+        seen = float(target.weight.sum())
+
+        def error(strength: float) -> float:
+            hands = PosedHands(self.model, fitted | smoothed_pose(fitted, strength))
+            point = hands.keypoints() * fitted["log_scale"].exp()
+            return float(keypoint_costs(point, target, self.config.doubt).sum()) / max(seen, 1.0)
+
+        strength = best_strength(error, len(fitted["translation"]), 2.0 * seen)
+        if strength > 0.0:
+            for name, value in smoothed_pose(fitted, strength).items():
+                self.parameters[name].copy_(value)
 
     def _place_by_depth(self, target: DepthTarget) -> None:
         """Move the hand to where depth was measured, if keypoints left it out of the loss's reach.

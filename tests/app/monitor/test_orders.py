@@ -17,7 +17,7 @@ OVERRIDES = {
     "object_.search.generations": 12,
     "simulation.stiffness": 2000.0,
     "object_.search.variables.drag": None,
-    "object_.search.variables.friction": {"low": 0.0, "high": 1.0, "scale": "linear"},
+    "object_.search.variables.restitution": {"low": 0.0, "high": 1.0, "scale": "linear"},
     "refinement.iterations": load_profile("quick").refinement.iterations,
 }
 
@@ -45,13 +45,13 @@ def test_only_what_differs_is_kept_as_changes_and_all_settings_are_stored(
     assert settings.object_.search.generations == 12
     assert settings.simulation.stiffness == 2000.0
     assert "drag" not in settings.object_.search.variables
-    assert settings.object_.search.variables["friction"].high == 1.0
+    assert settings.object_.search.variables["restitution"].high == 1.0
     assert settings.hand == load_profile("quick").hand
     shown = world.client.get(f"/api/v1/runs/{run_id}").json()
     assert (shown["parent"], shown["overrides"]) == ("fitted", changed)
     rows = {row["path"]: (row["base"], row["value"]) for row in shown["changes"]}
     assert rows["object_.search.generations"] == ("6", "12")
-    assert rows["object_.search.variables.friction"] == ("not searched", "0 to 1")
+    assert rows["object_.search.variables.restitution"] == ("not searched", "0 to 1")
     assert rows["object_.search.variables.drag"] == ("0 to 10", "not searched")
     titles = {row["path"]: row["title"] for row in shown["changes"]}
     assert titles["object_.search.generations"] == "object / search / generations"

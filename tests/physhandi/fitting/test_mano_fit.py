@@ -188,6 +188,6 @@ def test_a_whole_run_refines_mano_goes_on_after_a_stop_and_outlives_mano(
     np.testing.assert_array_equal(held[1].rest_length, held[0].rest_length)
     for file in (f"{base}/hand_right_{part}.npy" for part in ("vertex", "face", "keypoint")):
         np.testing.assert_array_equal(again.array(file), run.array(file))
-    assert export_run(again, "gltf", tmp_path / "again.glb").stat().st_size > 100_000
+    assert export_run(again, "gltf", tmp_path / "again.glb").stat().st_size > 50_000
     # Without points of the hand a run is measured with those of its sequence.
     assert measured_without_hand_points(run, folder) == run.json("metrics.json")["towel_fold"]

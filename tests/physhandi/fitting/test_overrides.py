@@ -77,12 +77,12 @@ def test_the_settings_of_any_profile_lie_within_the_bounds(name: str) -> None:
 
 
 def test_what_is_changed_changes_and_nothing_else() -> None:
-    friction = {"low": 0.1, "high": 1.5, "scale": "linear"}
+    restitution = {"low": 0.1, "high": 0.9, "scale": "linear"}
     overrides = {
         "object_.search.generations": 12,
         "simulation.stiffness": 2000,
         "object_.search.variables.drag": None,
-        "object_.search.variables.friction": friction,
+        "object_.search.variables.restitution": restitution,
         "object_.first_order.window": 5,
         "simulation.self_collision": True,
     }
@@ -91,9 +91,9 @@ def test_what_is_changed_changes_and_nothing_else() -> None:
     assert isinstance(changed.simulation.stiffness, float)
     assert list(changed.object_.search.variables) == [
         *[name for name in QUICK.object_.search.variables if name != "drag"],
-        "friction",
+        "restitution",
     ]
-    assert changed.object_.search.variables["friction"].high == 1.5
+    assert changed.object_.search.variables["restitution"].high == 0.9
     assert overrides_of(changed, QUICK) == overrides
     assert overrides_of(QUICK, QUICK) == {}
     back = apply_overrides(changed, overrides_of(QUICK, changed))
@@ -196,3 +196,17 @@ def test_settings_that_a_stored_configuration_lacks_are_dropped_and_only_these()
     # A searched parameter is a choice, not a setting that there was not yet.
     assert known["object_"]["search"] == asked["object_"]["search"]
     assert known["node_spacing"] == QUICK.node_spacing != stored["node_spacing"]
+
+
+def test_an_interval_that_a_profile_got_later_is_newer_than_runs_made_before() -> None:
+    asked, stored = QUICK.to_dict(), QUICK.to_dict()
+    del stored["object_"]["search"]["variables"]["friction"]
+    # A run of today that does not search it was asked for that.
+    assert "friction" in without_newer(asked, stored)["object_"]["search"]["variables"]
+    del stored["hand"]["smooths_motion"]
+    assert without_newer(asked, stored) == stored
+    # Of an older run it was not asked for, but another interval than the profile's is asked for.
+    other = {"low": 0.2, "high": 1.0, "scale": "linear"}
+    changed = apply_overrides(QUICK, {"object_.search.variables.friction": other}).to_dict()
+    known = without_newer(changed, stored)["object_"]["search"]["variables"]
+    assert known["friction"]["high"] == 1.0
