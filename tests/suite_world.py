@@ -23,6 +23,7 @@ SETTINGS = {
     "simulation.virtual_connection_radius": 0.02,
     "simulation.stiffness": 400.0,
     "simulation.virtual_stiffness": 2000.0,
+    "object_.search.variables.friction": None,
     "object_.search.variables.connection_radius": {"low": 0.06, "high": 0.12, "scale": "linear"},
     "object_.search.variables.virtual_connection_radius": {
         "low": 0.01,
