@@ -157,7 +157,8 @@ def find_contacts(
     for begin, end in _runs_without(held, last):
         fall = np.minimum(0.5 * gravity * ((end - begin) / frame_rate) ** 2, height[end])
         index = _follower(hands, shown, (begin, end), fall, LONGEST_HOLD * reach, spacing)
-        held += [] if index is None else [(index, begin, end)]
+        if index is not None:
+            held.append((index, begin, end))
     holding = np.unique([nearest[last, index] for index, _, end in held if end == last]).astype(int)
     until = _openings(np.asarray(control, np.float64), holding, last, window, spacing)
     held = [

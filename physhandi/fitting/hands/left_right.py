@@ -92,8 +92,8 @@ def _template_error(
     keypoint: Float[ndarray, "view frame 2 21 3"],
     templates: Many[Float[ndarray, "21 3"]],
 ) -> float:
-    """Measure how badly the templates fit what all views triangulate, averaged [m]."""
-    error = [0.0]
+    """Sum up how far the templates are from hands that all views triangulate, over frames [m]."""
+    error = 0.0
     for hand, template in enumerate(templates):
         seen = keypoint[:, :, hand].astype(np.float64).reshape(len(cameras), -1, 3)
         weight = np.nan_to_num(seen[..., 2])
@@ -101,5 +101,5 @@ def _template_error(
         for whole in point[np.isfinite(point).all((1, 2))]:
             rotation, offset = align(template, whole)
             away = rotation.apply(template) + offset - whole
-            error.append(float(np.linalg.norm(away, axis=1).mean()))
-    return float(np.sum(error))
+            error += float(np.linalg.norm(away, axis=1).mean())
+    return error

@@ -33,10 +33,9 @@ def smoothed(series: Float[ndarray, "frame ..."], strength: float) -> ndarray:
         return np.array(series, np.float64)
     # The bands of 1 + strength DᵀD, where D takes second differences.
     band = np.zeros((3, count))
-    ends = np.ones(count - 2)
     band[2] = 1.0
     for offset, weight in enumerate((1.0, 4.0, 1.0)):
-        band[2, offset : offset + count - 2] += strength * weight * ends
+        band[2, offset : offset + count - 2] += strength * weight
     band[1, 1:-1] -= 2.0 * strength
     band[1, 2:] -= 2.0 * strength
     band[0, 2:] = strength

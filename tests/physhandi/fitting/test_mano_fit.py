@@ -94,7 +94,12 @@ class Impatient(Progress):
 def brief_config_with_mano() -> PipelineConfig:
     """Little of each stage, with steps of the refinement that keypoints hold back nowhere."""
     config = load_profile("quick")
-    search = config.object_.search.replace(generations=1, population=4, widening_generations=0)
+    # Four candidates are better spent on springs than on friction.
+    variables = config.object_.search.variables | {}
+    del variables["friction"]
+    search = config.object_.search.replace(
+        generations=1, population=4, widening_generations=0, variables=variables
+    )
     first_order = config.object_.first_order.replace(iterations=1)
     return config.replace(
         hand=config.hand.replace(model="mano", iterations=60, depth_iterations=0),
@@ -188,6 +193,6 @@ def test_a_whole_run_refines_mano_goes_on_after_a_stop_and_outlives_mano(
     np.testing.assert_array_equal(held[1].rest_length, held[0].rest_length)
     for file in (f"{base}/hand_right_{part}.npy" for part in ("vertex", "face", "keypoint")):
         np.testing.assert_array_equal(again.array(file), run.array(file))
-    assert export_run(again, "gltf", tmp_path / "again.glb").stat().st_size > 50_000
+    assert export_run(again, "gltf", tmp_path / "again.glb").stat().st_size > 100_000
     # Without points of the hand a run is measured with those of its sequence.
     assert measured_without_hand_points(run, folder) == run.json("metrics.json")["towel_fold"]
