@@ -62,6 +62,8 @@ _SAMPLED = 5
 _NEAREST, _FARTHEST = 0.15, 3.5
 """Distances that the median of a depth image may have, unless the scale is given [m]."""
 _BOUNDS_GIVEN = (0.05, 12.0)
+_NO_DISTANCE = 1e6
+"""What renderers write where they see nothing is beyond this, whatever the unit."""
 _SCALES = (1.0, 0.01, 0.001, 0.00025, 0.0002, 0.0001)
 """Scales of known recorders: metres, centimetres, millimetres, L515, TUM, tenths of millimetres."""
 _JPEG_QUALITY = 95
@@ -462,7 +464,7 @@ def _depth_scale(
     for place in chosen:
         raw = stream.read(int(there[place]))
         is_float = raw.dtype.kind == "f"
-        known = raw[np.isfinite(raw) & (raw > 0)] if is_float else raw[raw > 0]
+        known = raw[(raw > 0) & (raw < _NO_DISTANCE)] if is_float else raw[raw > 0]
         if known.size:
             medians.append(float(np.median(known)))
     if not medians:

@@ -1,7 +1,7 @@
 """One stream of a raw recording: numbered images or a video, and when each image was taken."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -15,7 +15,18 @@ from numpy import ndarray
 from physhandi.data.arrays import read_array
 from physhandi.data.importers.phystwin_files import fail, probe_video
 from physhandi.data.importers.recorded_camera import read_table
-from physhandi.data.untrusted.image_header import MOST_PIXELS, announced_size
+from physhandi.data.untrusted.exr import (
+    depth_channels,
+    depth_of_picture,
+    read_exr_header,
+    require_exr,
+)
+from physhandi.data.untrusted.image_header import (
+    MOST_PIXELS,
+    AnnouncedImage,
+    announced_image,
+    is_whole,
+)
 from physhandi.data.untrusted.media import media_decoder
 from physhandi.errors import ImportFailedError
 
@@ -35,7 +46,9 @@ _READING = re.compile(r"\d+(?:\.\d*)?(?:[eE][+-]?\d{1,2})?")
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 _SHORTEST_STEP, _LONGEST_STEP = 2e-3, 2.0
 _LARGEST_TABLE = 64_000_000
-_TAIL = 2048
+_PICTURE = (
+    "has {} channels, so it is a picture of depth and holds no distances. Export raw 16-bit depth"
+)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -67,11 +80,26 @@ class RecordedStream:
         """Name an image for messages."""
         return str(self.files[index]) if self.files else f"{self.path}, frame {index}"
 
+    def check_files(self, indices: Iterable[int]) -> None:
+        """Read what images announce, and whether they end where they should; nothing is decoded.
+
+        Args:
+            indices: Numbers of the images; of a video nothing is known before it is decoded.
+
+        Raises:
+            ImportFailedError: If one of them cannot be decoded, or has another size or kind of
+                numbers than it must; names the first one.
+            UsageError: If a package is missing that decodes them.
+        """
+        for index in indices if self.files else ():
+            self._check_file(self.files[index])
+
     def read(self, index: int) -> ndarray:
         """Decode an image: BGR color, or raw depth values. A video is best read forwards.
 
         Raises:
             ImportFailedError: If that is not possible, or it has another size than the first one.
+            UsageError: See `check_files`.
         """
         image = self._frame(index) if not self.files else self._image(self.files[index])
         if (image.shape[1], image.shape[0]) != (self.width, self.height):
@@ -80,10 +108,7 @@ class RecordedStream:
                 f"is {image.shape[1]}x{image.shape[0]} px, but the images before it are "
                 f"{self.width}x{self.height}. All images of a stream need one size",
             )
-        if self.kind == "depth":
-            self._check_depth(index, image)
-            image = image.reshape(image.shape[:2])
-        return image
+        return image.reshape(image.shape[:2]) if self.kind == "depth" else image
 
     def close(self) -> None:
         """Release the video decoder."""
@@ -91,28 +116,32 @@ class RecordedStream:
             media_decoder().release(self.path)
 
     def _image(self, path: Path) -> ndarray:
-        size = image_size(path)
-        if size != (self.width, self.height):
-            fail(
-                path,
-                f"is {size[0]}x{size[1]} px, but {self.files[0].name} is "
-                f"{self.width}x{self.height}. All images of a stream need one size",
-            )
-        if path.suffix.lower() == ".npy":
+        # Checked again: it may be another file than it was when the import began.
+        announced = self._check_file(path)
+        if announced.form == "NPY":
             return read_array(path)
-        if not is_whole(path):
-            fail(path, "was cut off: its end is missing. Record or export it again")
-        flags = cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED
-        image = media_decoder().image(path, flags)
-        if image is None and path.suffix.lower() == ".exr":
-            fail(
-                path,
-                "cannot be decoded: this build of OpenCV reads no OpenEXR. Convert depth to 16-bit "
-                "PNG or .npy",
-            )
+        if announced.form == "EXR":
+            image = _exr_depth(path)
+        else:
+            flags = cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED
+            image = media_decoder().image(path, flags)
         if image is None:
             fail(path, "cannot be decoded; it is damaged or was cut off. Record or export it again")
         return image
+
+    def _check_file(self, path: Path) -> AnnouncedImage:
+        announced = _announced(path)
+        if announced.size != (self.width, self.height):
+            fail(
+                path,
+                f"is {announced.width}x{announced.height} px, but {self.files[0].name} is "
+                f"{self.width}x{self.height}. All images of a stream need one size",
+            )
+        if self.kind == "depth":
+            _check_depth(path, announced)
+        if not is_whole(path, announced.form):
+            fail(path, "was cut off: its end is missing. Record or export it again")
+        return announced
 
     def _frame(self, index: int) -> ndarray:
         image, at = media_decoder().frame(self.path, index)
@@ -124,23 +153,40 @@ class RecordedStream:
             )
         return image
 
-    def _check_depth(self, index: int, image: ndarray) -> None:
-        if image.ndim == 3 and image.shape[2] != 1:
-            self._refuse(
-                index,
-                f"has {image.shape[2]} channels, so it is a picture of depth and holds no "
-                "distances. Export raw 16-bit depth",
-            )
-        if image.dtype == np.uint8:
-            self._refuse(
-                index,
-                "has 8 bits a pixel, which is too coarse for distances. Export raw 16-bit depth",
-            )
-        if image.dtype.kind not in "uif":
-            self._refuse(index, f"holds {image.dtype}; expected numbers")
-
     def _refuse(self, index: int, reason: str) -> NoReturn:
         raise ImportFailedError(f"{self.name(index)}: {reason}.")
+
+
+def _check_depth(path: Path, announced: AnnouncedImage) -> None:
+    """Refuse images that hold no distances."""
+    if announced.form == "EXR":
+        require_exr(path)
+    elif announced.channel_count != 1:
+        fail(path, _PICTURE.format(announced.channel_count))
+    if announced.number == np.uint8:
+        fail(path, "has 8 bits a pixel, which is too coarse for distances. Export raw 16-bit depth")
+    if announced.number.kind not in "uif":
+        fail(path, f"holds {announced.number}; expected numbers")
+
+
+def _exr_depth(path: Path) -> ndarray | None:
+    """Decode depth; red, green and blue count as depth if they say the same."""
+    with path.open("rb") as stream:
+        names = depth_channels([*read_exr_header(stream).channels])
+    image = media_decoder().exr(path, names)
+    if image is None or len(names) == 1:
+        return image
+    depth = depth_of_picture(image)
+    if depth is None:
+        fail(path, _PICTURE.format(len(names)))
+    return depth
+
+
+def _announced(path: Path) -> AnnouncedImage:
+    try:
+        return announced_image(path)
+    except (ValueError, OSError) as error:
+        fail(path, str(error))
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -149,20 +195,24 @@ def image_size(path: Path) -> tuple[int, int]:
     Raises:
         ImportFailedError: If it is none, is empty, or announces a size that cannot be.
     """
-    try:
-        return announced_size(path)
-    except (ValueError, OSError) as error:
-        fail(path, str(error))
+    return _announced(path).size
 
 
-def is_whole(path: Path) -> bool:
-    """Tell whether a PNG or JPEG has its end; decoders fill what is missing without a word."""
-    with path.open("rb") as stream:
-        stream.seek(0, 2)
-        stream.seek(max(0, stream.tell() - _TAIL))
-        tail = stream.read()
-    ends = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
-    return ends.get(path.suffix.lower(), b"") in tail
+def check_picture(path: Path, size: tuple[int, int]) -> None:
+    """Refuse a picture that lacks its end, or has another size than a view's images.
+
+    Raises:
+        ImportFailedError: If it does; names it.
+    """
+    announced = _announced(path)
+    if announced.size != size:
+        fail(
+            path,
+            f"is {announced.width}x{announced.height} px, but the view's images are {size[0]}x"
+            f"{size[1]} px. Take the pictures with the same settings",
+        )
+    if not is_whole(path, announced.form):
+        fail(path, "was cut off: its end is missing. Take or export it again")
 
 
 def find_stream(folder: Path, kind: StreamKind) -> RecordedStream | None:

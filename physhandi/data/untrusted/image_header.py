@@ -6,16 +6,23 @@ A file of a few hundred bytes can announce a picture that fills all memory.
 import math
 import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
 
 from physhandi.data.arrays import read_array
+from physhandi.data.untrusted.exr import MAGIC as _EXR
+from physhandi.data.untrusted.exr import depth_channels, is_whole_exr, read_exr_header
 
 MOST_PIXELS = 50_000_000
 """Pixels of the largest image that is decoded: 8,192 x 6,144."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_EXR = b"\x76\x2f\x31\x01"
+_ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
+_TAIL = 2048
+"""Bytes at the end of a file in which its end is looked for."""
 _MOST_SEGMENTS = 4096
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """Numbers a pixel of each color type of PNG."""
@@ -25,8 +32,42 @@ _CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl"}
 """Boxes of MP4 that lead to sample descriptions."""
 
 
+ImageForm = Literal["PNG", "JPEG", "EXR", "NPY"]
+
+
+@dataclass(frozen=True)
+class AnnouncedImage:
+    """What an image file announces."""
+
+    form: ImageForm
+    """Its format, by its content."""
+    width: int
+    """Width [px]."""
+    height: int
+    """Height [px]."""
+    channel_count: int
+    """Numbers a pixel; of OpenEXR, channels that may hold depth."""
+    number: np.dtype[Any]
+    """Kind of these numbers."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.width, self.height
+
+
 def announced_size(path: Path) -> tuple[int, int]:
     """Read the width and height [px] that a PNG, JPEG, EXR or ``.npy`` file announces.
+
+    Raises:
+        ValueError: See `announced_image`.
+        OSError: If it cannot be read.
+    """
+    return announced_image(path).size
+
+
+def announced_image(path: Path) -> AnnouncedImage:
+    """Read what a PNG, JPEG, EXR or ``.npy`` file announces.
 
     Raises:
         ValueError: If it is none of these, ends within its header, or announces more than
@@ -39,17 +80,34 @@ def announced_size(path: Path) -> tuple[int, int]:
             if start.startswith(_PNG):
                 if start[12:16] != b"IHDR":
                     raise ValueError("has a damaged PNG header")
-                size = _png_size(start, path.stat().st_size)
+                announced = _png(start, path.stat().st_size)
             elif start.startswith(_JPEG):
-                size = _jpeg_size(stream)
+                announced = _jpeg(stream)
             elif start.startswith(_EXR):
-                size = _exr_size(stream)
+                announced = _exr(stream)
             else:
-                size = _npy_size(path)
+                announced = _npy(path)
         except struct.error:
             raise ValueError("ends within its header, so it was cut off") from None
-    check_pixels(size, path)
-    return size
+    check_pixels(announced.size, path)
+    return announced
+
+
+def is_whole(path: Path, form: ImageForm) -> bool:
+    """Tell whether an image has its end; decoders fill what is missing without a word.
+
+    Args:
+        path: File with a sound header; an ``.npy`` file without its end has none.
+        form: Its format.
+    """
+    if form == "EXR":
+        return is_whole_exr(path)
+    if form == "NPY":
+        return True
+    with path.open("rb") as stream:
+        stream.seek(0, 2)
+        stream.seek(max(0, stream.tell() - _TAIL))
+        return _ENDS[form] in stream.read()
 
 
 def check_pixels(size: tuple[int, int], path: Path) -> None:
@@ -119,17 +177,19 @@ def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, int]]:
         yield kind, at + skipped
 
 
-def _png_size(start: bytes, file_size: int) -> tuple[int, int]:
+def _png(start: bytes, file_size: int) -> AnnouncedImage:
     width, height, bits, color = struct.unpack(">IIBB", start[16:26])
-    row = 1 + (width * bits * _CHANNELS.get(color, 1) + 7) // 8
+    channels = _CHANNELS.get(color, 1)
+    row = 1 + (width * bits * channels + 7) // 8
     if width * height <= MOST_PIXELS and row * height > _DEFLATE * file_size:
         raise ValueError(
             f"announces {width}x{height} px, which a file of {file_size} bytes cannot hold"
         )
-    return width, height
+    number = np.dtype(np.uint16 if bits == 16 else np.uint8)
+    return AnnouncedImage("PNG", width, height, channels, number)
 
 
-def _jpeg_size(stream: BinaryIO) -> tuple[int, int]:
+def _jpeg(stream: BinaryIO) -> AnnouncedImage:
     """Go from segment to segment until the one that describes the frame."""
     stream.seek(2)
     for _ in range(_MOST_SEGMENTS):
@@ -143,45 +203,34 @@ def _jpeg_size(stream: BinaryIO) -> tuple[int, int]:
             continue
         (length,) = struct.unpack(">H", stream.read(2))
         if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
-            height, width = struct.unpack(">xHH", stream.read(5))
-            return width, height
+            height, width, channels = struct.unpack(">xHHB", stream.read(6))
+            return AnnouncedImage("JPEG", width, height, channels, np.dtype(np.uint8))
         stream.seek(length - 2, 1)
     raise ValueError("has no size in its JPEG header")
 
 
-def _exr_size(stream: BinaryIO) -> tuple[int, int]:
-    """Find the attribute ``dataWindow`` among the first of an OpenEXR header."""
-    stream.seek(8)
-    for _ in range(_MOST_SEGMENTS):
-        name = _text(stream)
-        if not name:
-            break
-        _text(stream)  # Type of the attribute.
-        (length,) = struct.unpack("<i", stream.read(4))
-        if name == b"dataWindow":
-            left, top, right, bottom = struct.unpack("<4i", stream.read(16))
-            return right - left + 1, bottom - top + 1
-        stream.seek(max(0, length), 1)
-    raise ValueError("has no size in its OpenEXR header")
+def _exr(stream: BinaryIO) -> AnnouncedImage:
+    header = read_exr_header(stream)
+    chosen = depth_channels([*header.channels])
+    pixels = header.width * header.height
+    # Every channel is decoded, also those that nobody asks for.
+    if pixels <= MOST_PIXELS and pixels * len(header.channels) > 2 * MOST_PIXELS:
+        raise ValueError(
+            f"announces {len(header.channels)} channels of {header.width}x{header.height} px; "
+            f"at most {2 * MOST_PIXELS} numbers are read"
+        )
+    number = header.channels[chosen[0]]
+    return AnnouncedImage("EXR", header.width, header.height, len(chosen), number)
 
 
-def _text(stream: BinaryIO) -> bytes:
-    text = b""
-    while len(text) < 256:
-        (byte,) = struct.unpack("c", stream.read(1))
-        if byte == b"\0":
-            return text
-        text += byte
-    raise ValueError("has a damaged OpenEXR header")
-
-
-def _npy_size(path: Path) -> tuple[int, int]:
+def _npy(path: Path) -> AnnouncedImage:
     try:
-        shape = read_array(path, mmap=True).shape
+        array = read_array(path, mmap=True)
     except ValueError as error:
         raise ValueError(
             f"is neither PNG, JPEG, EXR nor a whole .npy file of plain numbers ({error})"
         ) from None
+    shape = array.shape
     if len(shape) not in (2, 3) or (len(shape) == 3 and math.prod(shape[2:]) > 4):
         raise ValueError(f"holds an array {shape}; expected one image (row, column)")
-    return shape[1], shape[0]
+    return AnnouncedImage("NPY", shape[1], shape[0], math.prod(shape[2:]), array.dtype)

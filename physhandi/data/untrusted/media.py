@@ -19,6 +19,7 @@ import numpy as np
 from numpy import ndarray
 
 from physhandi.child import AnsweringChild, Channel, ChildEndedError, run_child
+from physhandi.data.untrusted.exr import decode_exr
 from physhandi.data.untrusted.image_header import MOST_PIXELS
 from physhandi.data.untrusted.pickles import limit
 from physhandi.errors import ImportFailedError
@@ -63,6 +64,14 @@ class MediaDecoder:
             ImportFailedError: If decoding it needs too much memory or time, or crashes.
         """
         return self._ask(str(path), do="image", path=str(path.absolute()), flags=flags)[1]
+
+    def exr(self, path: Path, channels: list[str]) -> ndarray | None:
+        """Decode channels of an OpenEXR image, side by side; None if they cannot be decoded.
+
+        Raises:
+            ImportFailedError: See `image`.
+        """
+        return self._ask(str(path), do="exr", path=str(path.absolute()), channels=channels)[1]
 
     def probe(self, path: Path) -> tuple[int, int, int, float]:
         """Ask for a video's frame count (0 if there is no video), width, height [px], rate [Hz].
@@ -210,6 +219,8 @@ def decode(request: dict[str, Any], videos: _Videos) -> tuple[dict[str, Any], nd
         return {"video": _probed(request["path"])}, None
     if request["do"] == "frame":
         return videos.frame(request["path"], request["index"])
+    if request["do"] == "exr":
+        return {}, decode_exr(request["path"], request["channels"])
     return {}, cast("ndarray | None", cv2.imread(request["path"], request["flags"]))
 
 

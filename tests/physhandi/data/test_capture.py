@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from raw_capture import BOARD, CAMERAS, FRAMES, RawCapture, ball, camera_at, intrinsics, picture
 
@@ -197,6 +198,49 @@ def test_float_depth_in_metres_and_its_holes(tmp_path):
     true = picture(raw.cameras["only"], 1)[1]
     assert abs(found[50, 50] - true[50, 50]) < 6e-4
     assert "taken for metres" in " ".join(sequence.provenance["notes"])
+
+
+@pytest.mark.parametrize(
+    ("channel", "kind", "scale"),
+    [
+        ("Z", np.float32, 1.0),
+        ("Y", np.float16, 1.0),
+        ("R", np.uint32, 0.001),
+        ("ViewLayer.Depth.Z", np.float32, 0.01),
+    ],
+)
+def test_depth_in_openexr_and_its_holes(tmp_path, channel, kind, scale):
+    raw = long_capture(tmp_path / "raw", 3)
+    true = picture(raw.cameras["only"], 1)[1]
+    for path in sorted((raw.folder / "only/depth").iterdir()):
+        depth = picture(raw.cameras["only"], int(path.stem))[1] / scale
+        if kind != np.uint32:
+            depth[10:20, 5], depth[31, 6] = np.nan, np.inf
+            depth[:, 40:] = 1e10 if kind == np.float32 else np.inf  # More than half of the picture.
+        channels = {channel: (np.round(depth) if kind == np.uint32 else depth).astype(kind)}
+        if "." in channel:
+            channels["ViewLayer.Combined.R"] = np.zeros_like(channels[channel])
+        OpenEXR.File({}, channels).write(str(path.with_suffix(".exr")))
+        path.unlink()
+    options = CaptureOptions(depth_scale=0.01 if scale == 0.01 else None)
+    sequence = import_capture(raw.folder, tmp_path / "out", options=options)
+    found = sequence.views[0].depth(1)
+    assert np.abs(found[50:, :40] - true[50:, :40]).max() < 1.1e-3  # Halves have 11 bits.
+    if kind != np.uint32:
+        assert not found[10:20, 5].any()
+        assert not found[:, 40:].any()
+    assert sequence.provenance["depth_scale"] == {"only": scale}
+
+
+def test_depth_in_openexr_says_what_to_install(tmp_path, monkeypatch):
+    raw = long_capture(tmp_path / "raw", 2)
+    for path in sorted((raw.folder / "only/depth").iterdir()):
+        depth = picture(raw.cameras["only"], int(path.stem))[1]
+        OpenEXR.File({}, {"Z": depth}).write(str(path.with_suffix(".exr")))
+        path.unlink()
+    monkeypatch.setattr("physhandi.data.untrusted.exr.find_spec", lambda _: None)
+    with pytest.raises(UsageError, match=r"00000\.exr needs .* pip install 'physhandi\[capture\]'"):
+        import_capture(raw.folder, tmp_path / "out")
 
 
 @pytest.mark.parametrize("scale", [0.0002, 5000.0])

@@ -1,41 +1,11 @@
 """Sizes are known before an image is decoded, whatever the file announces."""
 
-import struct
-import zlib
-
 import cv2
 import numpy as np
 import pytest
+from header_bombs import exr, png
 
 from physhandi.data.untrusted.image_header import announced_size
-
-
-def png(width: int, height: int) -> bytes:
-    """Write a PNG whose header says anything, with next to no pixels in it."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        )
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    pixels = zlib.compress(bytes(1000))
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
-    )
-
-
-def exr(width: int, height: int) -> bytes:
-    def attribute(name: bytes, kind: bytes, data: bytes) -> bytes:
-        return name + b"\0" + kind + b"\0" + struct.pack("<i", len(data)) + data
-
-    window = struct.pack("<4i", 3, 5, width + 2, height + 4)
-    start = b"\x76\x2f\x31\x01" + struct.pack("<i", 2)
-    return (
-        start
-        + attribute(b"compression", b"compression", b"\0")
-        + attribute(b"dataWindow", b"box2i", window)
-    )
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
@@ -56,7 +26,7 @@ def test_the_sizes_of_exr_and_npy_are_read(tmp_path):
 def test_a_small_file_that_announces_a_huge_image_is_refused(tmp_path, write):
     path = tmp_path / "bomb"
     path.write_bytes(write(100_000, 100_000))
-    assert path.stat().st_size < 300
+    assert path.stat().st_size < 400
     with pytest.raises(ValueError, match="100000x100000 px in a file of"):
         announced_size(path)
 
