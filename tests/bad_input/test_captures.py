@@ -11,11 +11,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
+from header_bombs import exr
 from hostile_pickles import Hostile
 from raw_capture import BOARD, CAMERAS, FRAMES, RawCapture, picture
 
-from physhandi.data.importers.capture import CaptureOptions, import_capture
+from physhandi.data.importers import recorded_stream
+from physhandi.data.importers.capture import CaptureOptions, import_capture, survey_capture
+from physhandi.data.untrusted.media import MediaDecoder
 from physhandi.errors import PhysHandiError
 
 Damage = Callable[[RawCapture], object]
@@ -48,6 +52,29 @@ def arrays(raw: RawCapture, change: Callable[[np.ndarray, int], np.ndarray]) -> 
         depth = picture(CAMERAS["left"], frame)[1]
         np.save(raw.folder / f"left/depth/{frame:05d}.npy", change(depth, frame))
         (raw.folder / f"left/depth/{frame:05d}.png").unlink()
+
+
+def exrs(change: Damage) -> Damage:
+    """Write the left camera's depth as OpenEXR in metres, and damage that."""
+
+    def damage(raw: RawCapture) -> None:
+        for frame in range(FRAMES):
+            path = raw.folder / f"left/depth/{frame:05d}.png"
+            depth = picture(CAMERAS["left"], frame)[1]
+            OpenEXR.File({}, {"Z": depth}).write(str(path.with_suffix(".exr")))
+            path.unlink()
+        change(raw)
+
+    return damage
+
+
+def written(rel: str, content: bytes) -> Damage:
+    return lambda raw: (raw.folder / rel).write_bytes(content)
+
+
+def painted_exr(raw: RawCapture) -> None:
+    color = picture(CAMERAS["left"], 4)[0].astype(np.float32)
+    OpenEXR.File({}, {"RGB": color}).write(str(raw.folder / "left/depth/00004.exr"))
 
 
 def images(rel: str, change: Callable[[np.ndarray], np.ndarray], *frames: int) -> Damage:
@@ -152,6 +179,27 @@ REFUSED: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "bomb in color": (bomb("left/color/00004.png"), ("00004.png", "100000x100000", "bytes")),
     "bomb in depth": (bomb("left/depth/00000.png"), ("depth/00000.png", "100000x100000")),
     "bomb in .npy": (array_bomb, ("depth/00002.npy",)),
+    "bomb in OpenEXR": (
+        exrs(written("left/depth/00004.exr", exr(100_000, 100_000))),
+        ("depth/00004.exr", "100000x100000", "bytes"),
+    ),
+    "many channels in OpenEXR": (
+        exrs(written("left/depth/00004.exr", exr(7_000, 7_000, names=("R", "G", "B")))),
+        ("depth/00004.exr", "3 channels of 7000x7000"),
+    ),
+    "cut OpenEXR": (exrs(torn("left/depth/00003.exr", 0.7)), ("depth/00003.exr", "cut off")),
+    "OpenEXR without pixels": (
+        exrs(written("left/depth/00003.exr", exr(96, 72))),
+        ("depth/00003.exr", "cut off"),
+    ),
+    "a picture in OpenEXR": (exrs(painted_exr), ("depth/00004.exr", "3 channels")),
+    "cut .npy": (
+        lambda raw: (
+            arrays(raw, lambda depth, _: depth),
+            torn("left/depth/00005.npy", 0.7)(raw),
+        ),
+        ("depth/00005.npy", "whole .npy"),
+    ),
     "images of two sizes": (
         images("left/color", lambda image: image[:50], 4),
         ("color/00004.png", "96x50", "96x72"),
@@ -302,6 +350,10 @@ BOARDS: dict[str, tuple[Damage, tuple[str, ...]]] = {
         bomb("calibration/left/00000.png"),
         ("calibration/left/00000.png", "100000x100000"),
     ),
+    "a cut picture": (
+        torn("calibration/right/00000.png", 0.7),
+        ("calibration/right/00000.png", "cut off"),
+    ),
     "no pictures": (
         removed("calibration/left/00000.png"),
         ("calibration/left", "no pictures of the board"),
@@ -320,6 +372,58 @@ def test_broken_pictures_of_the_board_are_refused(tmp_path, kind):
     message = str(refusal.value)
     assert [word for word in words if word not in message] == [], message
     assert left_behind(tmp_path) == []
+
+
+LAST = f"{FRAMES - 1:05d}"
+UNDECODED: dict[str, Damage] = {
+    "cut PNG": torn(f"right/depth/{LAST}.png", 0.7),
+    "bomb": bomb(f"right/color/{LAST}.png"),
+    "another size": images("right/depth", lambda image: image[:50], FRAMES - 1),
+    "8 bits": images("right/depth", lambda image: image.astype(np.uint8), FRAMES - 1),
+    "cut JPEG": lambda raw: (
+        [
+            cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path)))
+            for path in sorted((raw.folder / "right/color").iterdir())
+        ],
+        [path.unlink() for path in (raw.folder / "right/color").glob("*.png")],
+        torn(f"right/color/{LAST}.jpg", 0.7)(raw),
+    ),
+    "cut .npy": lambda raw: (
+        arrays(raw, lambda depth, _: depth),
+        torn(f"left/depth/{LAST}.npy", 0.7)(raw),
+    ),
+    "cut OpenEXR": exrs(torn(f"left/depth/{LAST}.exr", 0.7)),
+    "a cut picture of the board": lambda raw: (
+        raw.photograph_board(),
+        torn("calibration/right/00000.png", 0.7)(raw),
+    ),
+}
+"""What is broken in the last image of a recording."""
+
+
+@pytest.mark.parametrize("kind", UNDECODED)
+def test_nothing_is_decoded_before_all_files_are_looked_at(tmp_path, monkeypatch, kind):
+    raw = RawCapture(tmp_path / "raw").write()
+    UNDECODED[kind](raw)
+    decoded: list[object] = []
+    options = CaptureOptions(board=BOARD if "board" in kind else None)
+    monkeypatch.setattr(MediaDecoder, "_ask", lambda *_, **request: decoded.append(request))
+    monkeypatch.setattr(recorded_stream, "read_array", decoded.append)
+    with pytest.raises(PhysHandiError) as refusal:
+        import_capture(raw.folder, tmp_path / "out", options=options)
+    monkeypatch.undo()
+    assert decoded == []
+    assert LAST in str(refusal.value) or "calibration/right" in str(refusal.value)
+    assert left_behind(tmp_path) == []
+    assert str(refusal.value) in survey_capture(raw.folder, options).problems
+
+
+def test_broken_images_that_are_not_imported_do_no_harm(tmp_path):
+    raw = RawCapture(tmp_path / "raw").write()
+    torn(f"right/depth/{LAST}.png", 0.7)(raw)
+    options = CaptureOptions(stop=FRAMES - 1)
+    sequence = import_capture(raw.folder, tmp_path / "out", options=options)
+    assert sequence.frame_count == FRAMES - 1
 
 
 def test_depth_that_is_empty_in_a_frame_is_kept_and_told(tmp_path):

@@ -31,7 +31,7 @@ from physhandi.data.importers.recorded_camera import read_table
 from physhandi.data.importers.recorded_stream import (
     COLOR_SUFFIXES,
     RecordedStream,
-    image_size,
+    check_picture,
     natural_key,
 )
 from physhandi.data.importers.recorded_view import CALIBRATION, RecordedView, find_views
@@ -187,6 +187,8 @@ def import_capture(
     ):
         _refuse_same_names(views)
         paired = _paired(views, options)
+        _check_images(views, paired)
+        _check_board_pictures(source, views, _board(source, views, options))
         sources, notes = _sources(views, paired, options)
         placement = _place(source, sources, options, paired.count)
         cameras = [one.camera(pose) for one, pose in zip(sources, placement.poses, strict=True)]
@@ -321,6 +323,7 @@ def _surveyed(source: Path, views: list[RecordedView], options: CaptureOptions) 
     board: Board | None = None
     try:
         paired = _paired(views, options)
+        _check_images(views, paired)
         sources, told = _sources(views, paired, options)
         scales = {one.view.name: one.scale for one in sources if one.view.depth is not None}
         notes += [*told, *paired.notes]
@@ -328,6 +331,7 @@ def _surveyed(source: Path, views: list[RecordedView], options: CaptureOptions) 
         problems.append(str(error))
     try:
         board = options.board or _recorded_board(source)
+        _check_board_pictures(source, views, _board(source, views, options))
     except ImportFailedError as error:
         problems.append(str(error))
     way = "the pattern of the table" if options.by_table else _calibrated_by(source, views, board)
@@ -410,6 +414,13 @@ def _paired(views: Sequence[RecordedView], options: CaptureOptions) -> PairedFra
     streams = [stream for view in views for stream in view.streams]
     paired = pair_streams(names, streams, options.frame_rate)
     return cut(paired, options.start, options.stop, options.every)
+
+
+def _check_images(views: Sequence[RecordedView], paired: PairedFrames) -> None:
+    """Refuse images that cannot be decoded, before any is: the broken one may be the last."""
+    streams = [stream for view in views for stream in view.streams]
+    for stream, index in zip(streams, paired.index, strict=True):
+        stream.check_files(np.unique(index[index >= 0]).tolist())
 
 
 def _pairing_report(views: Sequence[RecordedView], paired: PairedFrames) -> dict[str, Any]:
@@ -513,13 +524,42 @@ def _recorded_board(source: Path) -> Board | None:
         fail(path, str(error).rstrip("."))
 
 
+def _board(source: Path, views: Sequence[RecordedView], options: CaptureOptions) -> Board | None:
+    """Tell by which board cameras are calibrated; None if by none."""
+    if options.by_table and len(views) > 1:
+        return None
+    return options.board or _recorded_board(source)
+
+
+def _check_board_pictures(
+    source: Path, views: Sequence[RecordedView], target: Board | None
+) -> None:
+    """Refuse pictures of the board that cannot be decoded, before any is."""
+    for view in views if target is not None else ():
+        for path in _board_pictures(source, view, is_alone=len(views) == 1) or ():
+            check_picture(path, view.size)
+
+
+def _board_pictures(source: Path, view: RecordedView, *, is_alone: bool) -> list[Path] | None:
+    """Find a view's pictures of the board; None if it has no folder for them."""
+    folder = source / CALIBRATION / view.folder.name
+    if is_alone and not folder.is_dir():
+        folder = source / CALIBRATION
+    if not folder.is_dir():
+        return None
+    files = [path for path in folder.iterdir() if path.suffix.lower() in COLOR_SUFFIXES]
+    if not files:
+        fail(folder, f"has no pictures of the board ({', '.join(sorted(COLOR_SUFFIXES))})")
+    return sorted(files, key=natural_key)
+
+
 def _place(
     source: Path, sources: list[_Source], options: CaptureOptions, frame_count: int
 ) -> _Placement:
     """Find where the cameras are, with z up and the table, where it is known, at a height."""
     if options.by_table and len(sources) > 1:
         return _by_table(sources, sorted({0, frame_count // 2}))
-    target = options.board or _recorded_board(source)
+    target = _board(source, [one.view for one in sources], options)
     if target is not None:
         return _by_board(source, sources, target)
     given = [one.view.T_world_camera for one in sources]
@@ -580,7 +620,7 @@ def _table_below(one: _Source, frames: list[int]) -> Float[ndarray, "4 4"]:
 
 
 def _by_board(source: Path, sources: list[_Source], target: Board) -> _Placement:
-    sightings = [_sightings(source, one, target, len(sources) == 1) for one in sources]
+    sightings = [_sightings(source, one, target, is_alone=len(sources) == 1) for one in sources]
     names = [one.view.name for one in sources]
     lenses = [one.rectifier.K for one in sources]
     sizes = [one.view.size for one in sources]
@@ -619,13 +659,12 @@ def _table_points(source: _Source, pose: ndarray) -> Float[ndarray, "point 3"]:
 
 
 def _sightings(
-    source: Path, one: _Source, target: Board, is_alone: bool
+    source: Path, one: _Source, target: Board, *, is_alone: bool
 ) -> list[BoardSighting | None]:
     """Look for the board in a view's calibration pictures, else in its first frames."""
-    folder = source / CALIBRATION / one.view.folder.name
-    if is_alone and not folder.is_dir():
-        folder = source / CALIBRATION
-    if not folder.is_dir():
+    files = _board_pictures(source, one.view, is_alone=is_alone)
+    if files is None:
+        folder = source / CALIBRATION / one.view.folder.name
         if one.view.color is None:
             fail(folder, "is missing, and the view has no color in which the board could be seen")
         count = min(_FIRST_FRAMES, 0 if one.color is None else len(one.color))
@@ -635,18 +674,8 @@ def _sightings(
             if found is not None:
                 return [found]
         return [None]
-    files = [p for p in folder.iterdir() if p.suffix.lower() in COLOR_SUFFIXES]
-    if not files:
-        fail(folder, f"has no pictures of the board ({', '.join(sorted(COLOR_SUFFIXES))})")
     sightings: list[BoardSighting | None] = []
-    for path in sorted(files, key=natural_key):
-        size = image_size(path)
-        if size != one.view.size:
-            fail(
-                path,
-                f"is {size[0]}x{size[1]} px, but the view's images are {one.view.size[0]}x"
-                f"{one.view.size[1]} px. Take the pictures with the same settings",
-            )
+    for path in files:
         image = one.rectifier.color(read_image(path, cv2.IMREAD_COLOR))
         sightings.append(find_board(image, target))
     return sightings
