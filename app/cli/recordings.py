@@ -194,13 +194,21 @@ def annotate(
             track_model=track_model,
             trusts_model_code=trust_model_code,
         )
-    show({"sequence": str(done.folder), "masks": _found(done), **_method(done)})
+    show({"sequence": str(done.folder), "masks": _found(done), **_method(done), **_doubts(done)})
 
 
 def _method(sequence: Sequence) -> dict[str, Any]:
     """Tell how points of a thin object were followed."""
     about = named_fields(sequence.provenance.get("tracks")) or {}
     return {"tracks": about["method"]} if "method" in about else {}
+
+
+def _doubts(sequence: Sequence) -> dict[str, Any]:
+    """Tell what hands say of the scale of depth, if they doubt it."""
+    from physhandi.fitting.checks.recording_check import depth_scale_problems
+
+    found = depth_scale_problems(sequence)
+    return {"problems": [f"{one.message} To do: {one.remedy}." for one in found]} if found else {}
 
 
 def _found(sequence: Sequence) -> dict[str, Any]:
@@ -528,6 +536,7 @@ def import_capture(
             "frame_rate": sequence.frame_rate,
             "masks": _found(sequence) if clicks else None,
             **_method(sequence),
+            **_doubts(sequence),
             **{name: sequence.provenance[name] for name in told if sequence.provenance[name]},
         }
     )

@@ -28,10 +28,17 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
 from physhandi.data.view import View
 from physhandi.errors import SequenceError, UsageError
+from physhandi.perception.hand_size import MEASURED_PALMS, palm_length
 from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
 from physhandi.perception.mask_model import MaskModel
 from physhandi.perception.point_tracking import PixelTracks, track_points, visible_on_object
-from physhandi.perception.segmentation import Click, carry_on, segment
+from physhandi.perception.segmentation import (
+    Click,
+    carry_on,
+    check_places,
+    detected_keypoints,
+    segment,
+)
 from physhandi.perception.thin_tracking import is_thin, thin_tracks
 from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
@@ -98,7 +105,9 @@ def annotate(
                 TrackModel(track_model, sequence, is_trusted=trusts_model_code)
             )
         finder = None if mask_model is None else MaskModel(mask_model)
-        masks = segment(sequence, clicks, progress, finder)
+        check_places(sequence, clicks)
+        detected = detected_keypoints(sequence, progress)
+        masks = segment(sequence, clicks, progress, finder, detected)
         tracks, method = _follow(sequence, masks, progress, tracker) if clicks else ({}, {})
         about = {
             part: {
@@ -111,8 +120,12 @@ def annotate(
     progress.check_cancelled()
     provenance: dict[str, Any] = {**sequence.provenance, "masks": about["masks"]}
     provenance.pop("tracks", None)
+    provenance.pop(MEASURED_PALMS, None)
     if tracks:
         provenance["tracks"] = {**about["tracks"], **method}
+    # Keypoints are not kept, so what they say of the depth's scale is.
+    if palms := _palm_lengths(sequence, detected):
+        provenance[MEASURED_PALMS] = palms
     return _store(sequence, masks, tracks, provenance)
 
 
@@ -190,6 +203,15 @@ def correct_masks(
     if of_tracks:
         provenance["tracks"] = of_tracks
     return _store(sequence, masks, tracks, provenance)
+
+
+def _palm_lengths(sequence: Sequence, detected: Mapping[str, ndarray]) -> dict[str, float]:
+    found = {
+        view.name: palm_length(view, detected[view.name])
+        for view in sequence.views
+        if view.has_depth and view.name in detected
+    }
+    return {name: round(length, 4) for name, length in found.items() if length is not None}
 
 
 def _stored_masks(view: View) -> UInt8[ndarray, "frame row column"]:

@@ -208,6 +208,7 @@ def segment(
     clicks: Many[Click],
     progress: Progress | None = None,
     model: MaskModel | None = None,
+    detected: Mapping[str, Float[ndarray, "frame hand 21 3"]] | None = None,
 ) -> dict[str, UInt8[ndarray, "frame row column"]]:
     """Label the pixels of all views with color.
 
@@ -218,6 +219,7 @@ def segment(
             is not enough. Without any, hands alone are labelled.
         progress: Told after every frame; may cancel.
         model: Follows object and hands in the place of what is built in.
+        detected: What `detected_keypoints` found; None if that is still to be done.
 
     Returns:
         By view: 0 background, 1 object, 2 right hand, 3 left hand.
@@ -234,11 +236,12 @@ def segment(
             f"Sequence '{sequence.name}': no view has color images, in which object and hands "
             "could be found. Add views/<view>/color.mp4 or color/, or give masks."
         )
-    for click in clicks:
-        _check_place(sequence, click)
+    check_places(sequence, clicks)
+    if detected is None:
+        detected = detected_keypoints(sequence, progress)
     found: list[_Seen] = []
     for view in colored:
-        keypoint = _keypoints(view, sequence, progress)
+        keypoint = detected.get(view.name, view.keypoint)
         if model is None and not view.has_depth:
             smaller = _SmallerView(view)
             found.append(_Seen(smaller, sequence, smaller.shrunk(keypoint)))
@@ -353,6 +356,28 @@ def _check_place(sequence: Sequence, click: Click) -> None:
         raise UsageError(
             f"{where}: is outside of the image. x goes from 0 to {width - 1}, y to {height - 1}."
         )
+
+
+def check_places(sequence: Sequence, clicks: Many[Click]) -> None:
+    """Refuse clicks where there is nothing to click on.
+
+    Raises:
+        UsageError: If there is one.
+    """
+    for click in clicks:
+        _check_place(sequence, click)
+
+
+def detected_keypoints(
+    sequence: Sequence, progress: Progress
+) -> dict[str, Float[ndarray, "frame hand 21 3"]]:
+    """Detect the hands of a sequence in views with color that have no keypoints, by their names."""
+    found = {
+        view.name: _keypoints(view, sequence, progress)
+        for view in sequence.views
+        if view.has_color and view.keypoint is None
+    }
+    return {name: keypoint for name, keypoint in found.items() if keypoint is not None}
 
 
 def _keypoints(

@@ -6,6 +6,7 @@ from made_models import write_cotracker
 
 from app import cli
 from physhandi.data.sequence import Sequence
+from physhandi.perception import hand_size
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -72,3 +73,15 @@ def test_models_of_the_user_are_named_by_their_folders(tmp_path, capsys):
     code, _, error = call(capsys, *capture)
     assert code == 2
     assert "find what --click names" in error
+
+
+def test_hands_of_an_impossible_size_are_told_at_once(tmp_path, capsys, monkeypatch):
+    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=4)
+    view, frame, x, y = disc_click()
+    command = ("annotate", sequence.folder, "--click", f"{view},{frame},{x:g},{y:g}")
+    assert "problems" not in call(capsys, *command)[1]
+    monkeypatch.setattr(hand_size, "PALM_LENGTHS", (0.2, 0.3))
+    code, out, error = call(capsys, *command)
+    assert code == 0, error
+    assert "View 'side': by its depth hands measure 5." in out
+    assert "To do: multiply its depth images by 1.7" in out

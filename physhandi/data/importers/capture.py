@@ -16,6 +16,7 @@ from numpy import ndarray
 import physhandi
 from physhandi.data import sequence as sequences
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.depth_scale import KNOWN_SCALES
 from physhandi.data.files import temporary_name
 from physhandi.data.importers.bag import find_bags, unpack_bags
 from physhandi.data.importers.board_calibration import (
@@ -64,8 +65,6 @@ _NEAREST, _FARTHEST = 0.15, 3.5
 _BOUNDS_GIVEN = (0.05, 12.0)
 _NO_DISTANCE = 1e6
 """What renderers write where they see nothing is beyond this, whatever the unit."""
-_SCALES = (1.0, 0.01, 0.001, 0.00025, 0.0002, 0.0001)
-"""Scales of known recorders: metres, centimetres, millimetres, L515, TUM, tenths of millimetres."""
 _JPEG_QUALITY = 95
 _FIRST_FRAMES = 5
 _UPRIGHT = np.cos(np.deg2rad(12))
@@ -496,7 +495,7 @@ def _depth_scale(
     elif scale > 1.0:
         scale = 1.0 / scale
     if not low <= scale * median <= high:
-        fits = [f"{s:g}" for s in _SCALES if _NEAREST <= s * median <= _FARTHEST]
+        fits = [f"{s:g}" for s in KNOWN_SCALES if _NEAREST <= s * median <= _FARTHEST]
         hint = (
             f"; {' or '.join(fits)} would make it {_NEAREST:g} to {_FARTHEST:g} m" if fits else ""
         )

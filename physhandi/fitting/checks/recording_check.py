@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 from numpy import ndarray
 
+from physhandi.data.depth_scale import likely_scales
+from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import SequenceError
@@ -25,6 +27,13 @@ from physhandi.fitting.checks.readiness import (
     shows_palm,
 )
 from physhandi.fitting.config import HANDS, OBSERVATION, STAGES
+from physhandi.perception.hand_size import (
+    MEASURED_PALMS,
+    PALM_LENGTH,
+    PALM_LENGTHS,
+    is_impossible_palm,
+    palm_length,
+)
 from physhandi.perception.lifting import (
     HAND_LABEL,
     OBJECT_LABEL,
@@ -148,8 +157,45 @@ def check_recording(
         if not any(problem.frame == 0 for problem in warnings):
             warnings.append(_SCATTERED)
     warnings += _judge_tracks(sequence)
+    warnings += depth_scale_problems(sequence)
     progress.report(CHECK_STAGE, total, total)
     return RecordingCheck(stages=stages, problems=tuple(_limited([*errors, *warnings])))
+
+
+def depth_scale_problems(sequence: Sequence) -> list[Problem]:
+    """Name views whose depth shows hands that are larger or smaller than hands are.
+
+    Keypoints are those that are stored, or those that were detected when masks were found.
+    """
+    detected = named_fields(sequence.provenance.get(MEASURED_PALMS)) or {}
+    scales = named_fields(sequence.provenance.get("depth_scale")) or {}
+    found: list[Problem] = []
+    for view in sequence.views if sequence.metric else ():
+        if not view.has_depth:
+            continue
+        keypoint = view.keypoint
+        told: Any = detected.get(view.name) if keypoint is None else palm_length(view, keypoint)
+        if isinstance(told, float) and told > 0 and is_impossible_palm(told):
+            found.append(_wrong_scale(view, told, scales.get(view.name)))
+    return found
+
+
+def _wrong_scale(view: View, length: float, scale: Any) -> Problem:
+    ratio = length / PALM_LENGTH
+    if isinstance(scale, float) and scale > 0:
+        right = " or ".join(f"{one:g}" for one in likely_scales(scale / ratio))
+        remedy = f"import it again with --depth-scale {right}, in the place of {scale:g}"
+    else:
+        remedy = f"multiply its depth images by {1 / ratio:.2g}"
+    low, high = (100 * end for end in PALM_LENGTHS)
+    return Problem(
+        level="warning",
+        message=f"View '{view.name}': by its depth hands measure {100 * length:.3g} cm from wrist "
+        f"to knuckles, {ratio:.2g} times as much as a hand's ({low:g} to {high:g} cm): the scale "
+        "of its depth is wrong.",
+        file=f"{view.place}/depth",
+        remedy=remedy,
+    )
 
 
 def _stopped(stages: Iterable[str], part: str) -> dict[str, StageReadiness]:

@@ -26,6 +26,10 @@ def filmed(tmp_path: Path) -> Path:
     # Pixels as close together as the pipeline fuses them.
     meta = folder / "sequence.yaml"
     meta.write_text(meta.read_text().replace("40.0", "400.0"))
+    # And a hand that is as large as hands are there.
+    keypoint = np.load(folder / "views/front/keypoint.npy")
+    keypoint[:, :, 0, :2], keypoint[:, :, [5, 9, 13, 17], :2] = (1, 18), (46, 18)
+    np.save(folder / "views/front/keypoint.npy", keypoint)
     for frame in range(FILMED_FRAMES):
         mask = np.zeros((36, 48), np.uint8)
         mask[4:28, 6:30] = 1
