@@ -12,7 +12,7 @@ from app.cli.output import AsJson, DataDir, Device, show
 from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
-from physhandi.errors import PhysHandiError, RunError, UsageError
+from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
 from physhandi.fitting.checks.readiness import StageReadiness
 from physhandi.fitting.config import HANDS, OBSERVATION
 from physhandi.progress import watched
@@ -510,7 +510,14 @@ def import_capture(
         raise UsageError("--mask-model and --track-model find what --click names; give that too.")
     clicks = [_click(text) for text in click]
     with watched(True) as progress:
-        sequence = convert(source, out, progress, options=options, overwrite=overwrite)
+        sequence = convert(
+            source,
+            out,
+            progress,
+            options=options,
+            overwrite=overwrite,
+            keeps_same=bool(clicks) and _awaits_masks(out),
+        )
         if clicks:
             from physhandi.perception.annotation import annotate as find
 
@@ -540,6 +547,16 @@ def import_capture(
             **{name: sequence.provenance[name] for name in told if sequence.provenance[name]},
         }
     )
+
+
+def _awaits_masks(folder: Path) -> bool:
+    """Tell whether a sequence is there whose masks the same command was still finding."""
+    from physhandi.perception.annotation import lacks_masks
+
+    try:
+        return lacks_masks(folder)
+    except SequenceError:  # There is none, or it is broken; the import says so.
+        return False
 
 
 def _write_example(folder: Path) -> None:

@@ -25,7 +25,7 @@ from physhandi.data.files import (
     write_yaml,
 )
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_meta import FILE
+from physhandi.data.sequence_meta import FILE, SequenceMeta, read_meta
 from physhandi.data.view import View
 from physhandi.errors import SequenceError, UsageError
 from physhandi.perception.hand_size import MEASURED_PALMS, palm_length
@@ -49,7 +49,10 @@ LENGTHS_ALONG = "lengths along it from its ends"
 """What it says of tracks of a thin object, as of a rope."""
 _HASH = "model_sha256"
 """What it says of those that a model of the user made here."""
-_FILES = ("mask", "track.npy", "track_visible.npy")
+_UNFINISHED = "unfinished"
+"""What it says of those that are being stored."""
+_TRACK_FILES = ("track.npy", "track_visible.npy")
+_FILES = ("mask", *_TRACK_FILES)
 
 
 def annotate(
@@ -90,6 +93,7 @@ def annotate(
         CancelledError: If the user asked to stop; what was there is left.
     """
     progress = progress or NullProgress()
+    _mend(Path(folder))
     sequence = Sequence.load(Path(folder))
     if not clicks and not sequence.hands:
         raise UsageError(
@@ -277,6 +281,8 @@ def _store(
     provenance: dict[str, Any],
 ) -> Sequence:
     """Give views their new masks and tracks, one after the other, and say where they come from."""
+    # If the process ends meanwhile, they are known to be ours, and not to be whole.
+    _note(sequence, {**provenance, "masks": {**provenance["masks"], _UNFINISHED: True}})
     for view in sequence.views:
         sweep_temporary(view.folder.glob(".*.tmp"))
         if view.name not in masks:
@@ -287,9 +293,38 @@ def _store(
             _put_in_place(made, view.folder)
         finally:
             shutil.rmtree(made, ignore_errors=True)
+    _note(sequence, provenance)
+    return Sequence.load(sequence.folder)
+
+
+def _note(sequence: Sequence, provenance: dict[str, Any]) -> None:
     meta = dataclasses.replace(sequence.meta, provenance=provenance)
     write_yaml(sequence.folder / FILE, meta.to_dict())
-    return Sequence.load(sequence.folder)
+
+
+def lacks_masks(folder: Path) -> bool:
+    """Tell whether a sequence has no masks, or was being given them when the process ended.
+
+    Raises:
+        SequenceError: If it cannot be opened.
+    """
+    _mend(folder)
+    sequence = Sequence.load(folder)
+    return _is_unfinished(sequence.meta) or not any(view.has_mask for view in sequence.views)
+
+
+def _is_unfinished(meta: SequenceMeta) -> bool:
+    return bool((named_fields(meta.provenance.get("masks")) or {}).get(_UNFINISHED))
+
+
+def _mend(folder: Path) -> None:
+    """Remove tracks of which a process that ended had put only half in place."""
+    meta = read_meta(folder)
+    for view in meta.views if _is_unfinished(meta) else ():
+        halves = [folder / "views" / view.name / name for name in _TRACK_FILES]
+        if not all(path.is_file() for path in halves):
+            for path in halves:
+                path.unlink(missing_ok=True)
 
 
 def _is_own(sequence: Sequence, part: str) -> bool:
@@ -298,6 +333,8 @@ def _is_own(sequence: Sequence, part: str) -> bool:
 
 
 def _check_own(sequence: Sequence) -> None:
+    if _is_unfinished(sequence.meta):
+        return
     for part, there in (
         ("masks", any(view.has_mask for view in sequence.views)),
         ("tracks", any(view.track is not None for view in sequence.views)),

@@ -1,5 +1,9 @@
 """The commands that turn other programs' files into ours."""
 
+import signal
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from clicked_disc import write_disc
@@ -161,6 +165,56 @@ def test_a_click_with_the_import_makes_masks_and_tracks_at_once(tmp_path, capsys
     code, _, error = call(capsys, *command, tmp_path / "third", "--click", "left,9")
     assert code == 2
     assert not (tmp_path / "third").exists()
+
+
+KILLED_WHILE_IT_FINDS_MASKS = """
+import os, signal, sys
+from app import cli
+from physhandi.perception import annotation
+annotation.segment = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+cli.main(sys.argv[1:])
+"""
+
+
+def test_an_import_that_was_killed_while_it_found_masks_goes_on(tmp_path, capsys):
+    raw = RawCapture(tmp_path / "raw").write(3)
+    x, y = CAMERAS["left"].project(ball(1)[0]).round()
+    command = ("import", "capture", raw.folder, "--out", tmp_path / "ball")
+    click = ("--click", f"left,1,{x:g},{y:g}")
+    words = [str(word) for word in (*command, *click)]
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED_WHILE_IT_FINDS_MASKS, *words], check=False
+    )
+    assert killed.returncode == -signal.SIGKILL
+    begun = Sequence.load(tmp_path / "ball")
+    assert begun.missing("mask") == ["mask"]
+    imported = [path.stat().st_mtime_ns for path in begun.folder.rglob("*.png")]
+    for other in ((), ("--every", 2, *click), ("--depth-scale", 0.0011, *click)):
+        code, _, error = call(capsys, *command, *other)
+        assert (code, "exists already" in error) == (1, True)
+    code, out, error = call(capsys, *command, *click)
+    assert code == 0, error
+    assert "frames with object: 3" in out
+    done = Sequence.load(tmp_path / "ball")
+    done.validate()
+    assert done.missing("mask", "track") == []
+    images = done.folder.glob("views/*/[cd]*/*.png")
+    assert sorted(path.stat().st_mtime_ns for path in images) == sorted(imported)
+    code, _, error = call(capsys, *command, *click)  # Now it is whole.
+    assert (code, "exists already" in error) == (1, True)
+
+
+def test_a_click_beside_the_object_leaves_an_import_that_another_click_completes(tmp_path, capsys):
+    raw = RawCapture(tmp_path / "raw").write(3)
+    command = ("import", "capture", raw.folder, "--out", tmp_path / "ball")
+    code, _, error = call(capsys, *command, "--click", "left,1,2,2")
+    assert code == 2
+    assert "left" in error
+    assert Sequence.load(tmp_path / "ball").missing("mask") == ["mask"]
+    x, y = CAMERAS["left"].project(ball(1)[0]).round()
+    code, out, error = call(capsys, *command, "--click", f"left,1,{x:g},{y:g}")
+    assert code == 0, error
+    assert "frames with object: 3" in out
 
 
 def test_hands_that_another_method_found_become_keypoints(tmp_path, capsys):

@@ -49,14 +49,16 @@ from physhandi.data.importers.view_agreement import (
     shared_surface,
     table_distance_ratio,
 )
-from physhandi.data.sequence_meta import SequenceMeta, Side, ViewMeta
+from physhandi.data.sequence_meta import FILE, SequenceMeta, Side, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.errors import ImportFailedError, UsageError, describe
+from physhandi.errors import ImportFailedError, SequenceError, UsageError, describe
 from physhandi.progress import NullProgress, Progress
 
 _STAGE = "import"
 BOARD_FILE = "board.json"
 """File beside the board's pictures that says which board it is."""
+_FINGERPRINT = "fingerprint"
+"""What provenance calls the hash of all that a sequence was made of."""
 BY_BOARD = "board"
 """How provenance begins to say that cameras were calibrated by a board."""
 _SAMPLED = 5
@@ -151,6 +153,7 @@ def import_capture(
     *,
     options: CaptureOptions | None = None,
     overwrite: bool = False,
+    keeps_same: bool = False,
 ) -> sequences.Sequence:
     """Convert a raw recording of one or several RGB-D or color cameras into a sequence.
 
@@ -166,6 +169,8 @@ def import_capture(
             it was stopped, or killed, unless the recording or an option was changed.
         options: What the recording does not say itself.
         overwrite: Whether to replace a sequence that is there.
+        keeps_same: Whether one that is there is taken as it is if it was made of the same recording
+            with the same options; else it is refused like any other.
 
     Raises:
         ImportFailedError: If a file is missing, broken or contradicts another one; names it.
@@ -189,12 +194,14 @@ def import_capture(
         _check_images(views, paired)
         _check_board_pictures(source, views, _board(source, views, options))
         sources, notes = _sources(views, paired, options)
+        origin = _origin(given, sources, options)
+        if keeps_same and not overwrite and _is_made_of(Path(out_folder), origin):
+            return sequences.Sequence.load(out_folder)
         placement = _place(source, sources, options, paired.count)
         cameras = [one.camera(pose) for one, pose in zip(sources, placement.poses, strict=True)]
         report = dict(placement.report)
         report["agreement"] = _check_agreement(sources, cameras, placement, paired.count)
         notes += [*paired.notes, *placement.notes]
-        origin = _origin(given, sources, options)
         with SequenceWriter(out_folder, overwrite=overwrite, origin=origin) as writer:
             notes += _write(writer, sources, paired, progress)
             meta = SequenceMeta(
@@ -211,6 +218,7 @@ def import_capture(
                 provenance={
                     "importer": "capture",
                     "folder": given.resolve().name,
+                    _FINGERPRINT: origin,
                     "frames": {"start": options.start, "every": options.every},
                     "depth_scale": {
                         one.view.name: one.scale for one in sources if one.view.depth is not None
@@ -222,6 +230,16 @@ def import_capture(
             )
             sequence = writer.finish(meta)
     return sequence
+
+
+def _is_made_of(folder: Path, origin: str) -> bool:
+    """Tell whether a folder is a sequence that was imported from the same, in the same way."""
+    if not (folder / FILE).is_file():
+        return False
+    try:
+        return sequences.Sequence.load(folder).provenance.get(_FINGERPRINT) == origin
+    except SequenceError:
+        return False
 
 
 def _origin(given: Path, sources: list[_Source], options: CaptureOptions) -> str:

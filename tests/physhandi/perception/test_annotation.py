@@ -1,4 +1,5 @@
 import hashlib
+import shutil
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,8 @@ from clicked_disc import FRAMES, disc_click, write_disc
 import physhandi
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, UsageError
-from physhandi.perception.annotation import Correction, annotate, correct_masks
+from physhandi.perception import annotation
+from physhandi.perception.annotation import Correction, annotate, correct_masks, lacks_masks
 from physhandi.perception.lifting import observe_object
 from physhandi.perception.segmentation import Click
 from physhandi.progress import Progress
@@ -171,3 +173,49 @@ def test_tracks_of_the_users_model_are_hidden_where_a_correction_shows_no_object
         if view.name == "top":
             column, row = pixel[2, view.track_visible[2]].round().astype(int).T
             assert (label[row, column] == 1).all()
+
+
+class _Killed(BaseException):
+    """Stands for the end of a process: nothing is cleared away after it."""
+
+
+@pytest.mark.parametrize("clicks", [[Click(*disc_click())], []], ids=["first time", "hands alone"])
+def test_masks_and_tracks_can_be_made_again_wherever_their_storing_ended(
+    tmp_path, monkeypatch, clicks
+):
+    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=3)
+    if not clicks:  # Tracks are there that are to go.
+        annotate(sequence.folder, [Click(*disc_click())])
+    stored = iter(range(100))
+    moves = Path.rename
+
+    def killed_at(last: int) -> None:
+        def rename(path: Path, target: Path) -> Path:
+            if next(stored) == last:
+                raise _Killed
+            return moves(path, target)
+
+        monkeypatch.setattr(Path, "rename", rename)
+        monkeypatch.setattr(annotation.shutil, "rmtree", lambda *_, **__: None)
+
+    ends = 0
+    for last in range(20):
+        folder = Path(shutil.copytree(sequence.folder, tmp_path / f"copy{last}"))
+        stored = iter(range(100))
+        killed_at(last)
+        try:
+            annotate(folder, clicks)
+        except _Killed:
+            ends += 1
+        else:
+            break
+        finally:
+            monkeypatch.undo()
+        assert lacks_masks(folder)
+        done = annotate(folder, clicks)
+        done.validate()
+        assert not lacks_masks(folder)
+        assert "unfinished" not in done.provenance["masks"]
+        assert all(view.has_mask for view in done.views)
+        assert all((view.track is not None) == bool(clicks) for view in done.views)
+    assert ends >= 6
