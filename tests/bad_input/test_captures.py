@@ -15,12 +15,24 @@ import OpenEXR
 import pytest
 from header_bombs import exr
 from hostile_pickles import Hostile
-from raw_capture import BOARD, CAMERAS, FRAMES, RawCapture, picture
+from raw_capture import (
+    BOARD,
+    CAMERAS,
+    FOCAL,
+    FRAMES,
+    RawCapture,
+    camera_at,
+    intrinsics,
+    picture,
+)
 
+from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers import recorded_stream
 from physhandi.data.importers.capture import CaptureOptions, import_capture, survey_capture
 from physhandi.data.untrusted.media import MediaDecoder
-from physhandi.errors import PhysHandiError
+from physhandi.errors import PhysHandiError, UsageError
+from physhandi.perception.annotation import annotate
+from physhandi.perception.segmentation import Click
 
 Damage = Callable[[RawCapture], object]
 
@@ -118,6 +130,26 @@ def table(view: str, **changes: object) -> Damage:
 def exchanged_poses(raw: RawCapture) -> None:
     raw.table("left", T_world_camera=CAMERAS["right"].T_world_camera.tolist())
     raw.table("right", T_world_camera=CAMERAS["left"].T_world_camera.tolist())
+
+
+def lens(camera: PinholeCamera, focal: float, x: float, y: float) -> PinholeCamera:
+    """The same camera with another focal length, and its middle moved [px]."""
+    K = camera.K + np.array([[focal - FOCAL, 0, x], [0, focal - FOCAL, y], [0, 0, 0]])
+    return PinholeCamera(K, camera.T_world_camera, camera.width, camera.height)
+
+
+def exchanged_intrinsics(right: PinholeCamera, *, tells_size: bool = True) -> Damage:
+    """The right camera is another one, and each camera has the intrinsics of the other one."""
+
+    def damage(raw: RawCapture) -> None:
+        shutil.rmtree(raw.folder)
+        raw.cameras = {"left": CAMERAS["left"], "right": right}
+        raw.write()
+        for view, other in (("left", right), ("right", CAMERAS["left"])):
+            size = {} if tells_size else {"width": None, "height": None}
+            raw.table(view, **{**intrinsics(other), **size})
+
+    return damage
 
 
 def unnumbered(raw: RawCapture) -> None:
@@ -244,6 +276,22 @@ REFUSED: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "intrinsics in another order": (
         table("left", fx=47.5, fy=35.5, cx=90.0, cy=90.0),
         ("left/intrinsics.json", "(90, 90)", "order"),
+    ),
+    "intrinsics of two modes exchanged": (
+        exchanged_intrinsics(camera_at(110, scale=2)),
+        ("left/intrinsics.json", "192x144", "96x72"),
+    ),
+    "the same without sizes": (
+        exchanged_intrinsics(camera_at(110, scale=2), tells_size=False),
+        ("left/intrinsics.json", "(95.5, 71.5)"),
+    ),
+    "intrinsics of two lenses exchanged": (
+        exchanged_intrinsics(lens(CAMERAS["right"], 110.0, 0, 0)),
+        ("left", "right", "contradict", "two intrinsics exchanged"),
+    ),
+    "intrinsics of two middles exchanged": (
+        exchanged_intrinsics(lens(CAMERAS["right"], FOCAL, 8, -6)),
+        ("left", "right", "contradict", "two intrinsics exchanged"),
     ),
     "normalized intrinsics": (
         table("left", fx=0.9, fy=1.2, cx=0.5, cy=0.5),
@@ -424,6 +472,16 @@ def test_broken_images_that_are_not_imported_do_no_harm(tmp_path):
     options = CaptureOptions(stop=FRAMES - 1)
     sequence = import_capture(raw.folder, tmp_path / "out", options=options)
     assert sequence.frame_count == FRAMES - 1
+
+
+@pytest.mark.parametrize("place", [(2, 2), (48, 66), (90, 20)])
+def test_a_click_beside_the_object_gives_no_empty_masks(tmp_path, place):
+    raw = RawCapture(tmp_path / "raw").write(3)
+    sequence = import_capture(raw.folder, tmp_path / "out")
+    before = {path: path.stat().st_mtime_ns for path in sequence.folder.rglob("*")}
+    with pytest.raises(UsageError, match=r"Click left,1,\d+,\d+: nothing there stands out"):
+        annotate(sequence.folder, [Click("left", 1, *place)])
+    assert {path: path.stat().st_mtime_ns for path in sequence.folder.rglob("*")} == before
 
 
 def test_depth_that_is_empty_in_a_frame_is_kept_and_told(tmp_path):

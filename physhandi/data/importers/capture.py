@@ -74,7 +74,7 @@ _TABLE_SHARE = 0.25
 _WALL = -0.25
 """A plane whose normal points up the picture less than this may be a wall."""
 _RATIO = (0.95, 1.05)
-_WRONG_SCALE = (0.8, 1.25)
+_WRONG_SCALE, _WRONG_LENS = (0.8, 1.25), (0.6, 1.6)
 _RATIO_SHARE = 0.2
 _LEAST_SHARED, _LEAST_SHARED_ABOVE = 0.45, 0.3
 _ABOVE = 0.02
@@ -806,10 +806,14 @@ def _check_table(
     if share < _RATIO_SHARE:
         return {}
     if not _WRONG_SCALE[0] <= ratio <= _WRONG_SCALE[1]:
+        # No lens is off by more, but two may be exchanged.
+        is_lens = _WRONG_LENS[0] < ratio < _WRONG_LENS[1]
+        other = ", unless its intrinsics are those of another camera (were two exchanged?)"
         fail(
             source.view.folder if source.view.depth is None else source.view.depth.path,
             f"puts the table {ratio:.3g} times as far from the camera as the board says. The depth "
-            f"scale is not {source.scale:g}; give --depth-scale {source.scale / ratio:.2g}",
+            f"scale is not {source.scale:g}; give --depth-scale {source.scale / ratio:.2g}"
+            f"{other if is_lens else ''}",
         )
     if not _RATIO[0] <= ratio <= _RATIO[1]:
         notes.append(

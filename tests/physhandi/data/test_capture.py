@@ -404,6 +404,25 @@ def test_the_board_of_the_first_frames_calibrates_too_and_tells_a_wrong_depth_sc
         )
 
 
+@pytest.mark.parametrize(
+    ("focal", "words"),
+    [(110.0, ["times as far", "were two exchanged"]), (95.0, ["contradict", "two intrinsics"])],
+)
+def test_the_board_tells_exchanged_intrinsics(tmp_path, focal, words):
+    lenses = {"left": camera_at(30, scale=4), "right": camera_at(110, scale=4)}
+    other = np.array(lenses["right"].K)
+    other[[0, 1], [0, 1]] = 4 * focal
+    size = lenses["right"].width, lenses["right"].height
+    lenses["right"] = PinholeCamera(other, lenses["right"].T_world_camera, *size)
+    raw = RawCapture(tmp_path / "raw", lenses).write(2, poses=False)
+    raw.photograph_board()
+    raw.table("left", **intrinsics(lenses["right"]))
+    raw.table("right", **intrinsics(lenses["left"]))
+    with pytest.raises(ImportFailedError) as refusal:
+        import_capture(raw.folder, tmp_path / "out", options=CaptureOptions(board=BOARD))
+    assert [word for word in words if word not in str(refusal.value)] == []
+
+
 @pytest.mark.parametrize("form", ["by name", "list", "of each", "calibrate", "one file"])
 def test_poses_may_stand_in_files_of_their_own(tmp_path, form):
     raw = RawCapture(tmp_path / "raw").write(2, poses=False)
