@@ -123,6 +123,24 @@ def video(raw: RawCapture, share: float = 1.0, name: str = "color.avi") -> None:
     path.write_bytes(content[: int(share * len(content))])
 
 
+def with_index_first(content: bytes) -> bytes:
+    """Put an MP4's index before its frames, as for streaming: what is cut off then is frames."""
+    at, boxes = 0, []
+    while at < len(content):
+        size = struct.unpack(">I", content[at : at + 4])[0]
+        boxes.append(content[at : at + size])
+        at += size
+    order = {b"ftyp": 0, b"moov": 1}
+    boxes.sort(key=lambda box: order.get(box[4:8], 2))
+    index = boxes[1]
+    shift, place = len(index), index.index(b"stco") + 4
+    count = struct.unpack(">I", index[place + 4 : place + 8])[0]
+    old = struct.unpack(f">{count}I", index[place + 8 : place + 8 + 4 * count])
+    new = struct.pack(f">{count}I", *[offset + shift for offset in old])
+    boxes[1] = index[: place + 8] + new + index[place + 8 + 4 * count :]
+    return b"".join(boxes)
+
+
 def table(view: str, **changes: object) -> Damage:
     return lambda raw: raw.table(view, **changes)
 
@@ -464,6 +482,29 @@ def test_nothing_is_decoded_before_all_files_are_looked_at(tmp_path, monkeypatch
     assert LAST in str(refusal.value) or "calibration/right" in str(refusal.value)
     assert left_behind(tmp_path) == []
     assert str(refusal.value) in survey_capture(raw.folder, options).problems
+
+
+@pytest.mark.parametrize("name", ["color.avi", "color.mp4"])
+def test_a_cut_video_is_told_before_any_image_is_decoded(tmp_path, monkeypatch, name):
+    raw = RawCapture(tmp_path / "raw").write()
+    video(raw, 1.0, name)
+    path = raw.folder / "left" / name
+    content = path.read_bytes()
+    path.write_bytes(with_index_first(content) if name.endswith("mp4") else content)
+    import_capture(raw.folder, tmp_path / "whole")
+    path.write_bytes(path.read_bytes()[: int(0.8 * len(content))])
+    asked: list[str] = []
+    ask = MediaDecoder._ask
+
+    def listen(decoder, place, **request):
+        asked.append(request["do"])
+        return ask(decoder, place, **request)
+
+    monkeypatch.setattr(MediaDecoder, "_ask", listen)
+    with pytest.raises(PhysHandiError, match=rf"{name}, frame \d: cannot .* --stop \d"):
+        import_capture(raw.folder, tmp_path / "out")
+    assert asked == ["probe", "frame"]
+    assert left_behind(tmp_path) == ["whole"]
 
 
 def test_broken_images_that_are_not_imported_do_no_harm(tmp_path):

@@ -26,6 +26,7 @@ from physhandi.data.untrusted.image_header import (
     AnnouncedImage,
     announced_image,
     is_whole,
+    is_whole_video,
 )
 from physhandi.data.untrusted.media import media_decoder
 from physhandi.errors import ImportFailedError
@@ -83,8 +84,10 @@ class RecordedStream:
     def check_files(self, indices: Iterable[int]) -> None:
         """Read what images announce, and whether they end where they should; nothing is decoded.
 
+        A video that is shorter than it announces is gone through, to tell which frame is missing.
+
         Args:
-            indices: Numbers of the images; of a video nothing is known before it is decoded.
+            indices: Numbers of the images.
 
         Raises:
             ImportFailedError: If one of them cannot be decoded, or has another size or kind of
@@ -93,6 +96,8 @@ class RecordedStream:
         """
         for index in indices if self.files else ():
             self._check_file(self.files[index])
+        if not self.files and not is_whole_video(self.path):
+            self._frame(max(indices, default=0))
 
     def read(self, index: int) -> ndarray:
         """Decode an image: BGR color, or raw depth values. A video is best read forwards.

@@ -28,6 +28,8 @@ _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """Numbers a pixel of each color type of PNG."""
 _DEFLATE = 1032
 """Bytes that one compressed byte can stand for at most (zlib's technical details)."""
+_FIRST_BOXES = {b"ftyp", b"moov", b"mdat", b"free", b"wide"}
+"""Boxes with which MP4 and MOV files begin."""
 _CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl"}
 """Boxes of MP4 that lead to sample descriptions."""
 
@@ -148,6 +150,33 @@ def video_size(path: Path) -> tuple[int, int] | None:
                 check_pixels((width, height), path)
                 return width, height
     return None
+
+
+def is_whole_video(path: Path) -> bool:
+    """Tell whether an AVI or MP4 video is as long as its parts announce; True for other formats.
+
+    Of a video that is shorter only its decoder can tell how many frames are left.
+    """
+    end = path.stat().st_size
+    with path.open("rb") as stream:
+        start = stream.read(12)
+        if start[:4] == b"RIFF" and len(start) == 12:
+            return struct.unpack("<I", start[4:8])[0] + 8 <= end
+        if start[4:8] not in _FIRST_BOXES:
+            return True
+        at = 0
+        for _ in range(_MOST_SEGMENTS):
+            stream.seek(at)
+            header = stream.read(16)
+            if len(header) < 8:
+                break
+            size = struct.unpack(">I", header[:4])[0]
+            if size == 1 and len(header) == 16:
+                size = struct.unpack(">Q", header[8:])[0]
+            if size < 8:  # The box goes on to the end of the file, or is none.
+                break
+            at += size
+        return at <= end
 
 
 def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, int]]:

@@ -1,11 +1,13 @@
 """Sizes are known before an image is decoded, whatever the file announces."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
 from header_bombs import exr, png
 
-from physhandi.data.untrusted.image_header import announced_size
+from physhandi.data.untrusted.image_header import announced_size, is_whole_video
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
@@ -46,3 +48,26 @@ def test_what_ends_in_its_header_or_is_no_image_is_refused(tmp_path):
     np.save(tmp_path / "x.npy", np.zeros((2, 3, 4, 5)))
     with pytest.raises(ValueError, match="one image"):
         announced_size(tmp_path / "x.npy")
+
+
+def box(kind: bytes, size: int, content: bytes = b"") -> bytes:
+    return struct.pack(">I", size) + kind + content
+
+
+@pytest.mark.parametrize(
+    ("content", "is_whole"),
+    [
+        (b"RIFF" + struct.pack("<I", 20) + b"AVI " + bytes(16), True),
+        (b"RIFF" + struct.pack("<I", 20) + b"AVI " + bytes(15), False),
+        (box(b"ftyp", 16, bytes(8)) + box(b"mdat", 24, bytes(16)), True),
+        (box(b"ftyp", 16, bytes(8)) + box(b"mdat", 24, bytes(15)), False),
+        (box(b"mdat", 1, struct.pack(">Q", 32) + bytes(16)), True),
+        (box(b"mdat", 1, struct.pack(">Q", 1 << 40) + bytes(16)), False),
+        (box(b"ftyp", 16, bytes(8)) + box(b"mdat", 0, bytes(5)), True),  # As long as the file.
+        (b"\x1a\x45\xdf\xa3" + bytes(20), True),  # Matroska need not say it.
+        (b"", True),
+    ],
+)
+def test_a_video_that_is_shorter_than_it_says_is_told(tmp_path, content, is_whole):
+    (tmp_path / "video").write_bytes(content)
+    assert is_whole_video(tmp_path / "video") == is_whole
