@@ -1,0 +1,77 @@
+"""The benchmark of imports, on a scene of a few frames; fits are told by hand."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app import cli
+from app.benchmarks import capture
+from app.benchmarks.capture import CaptureOrder, ScenePlace
+from physhandi.errors import RunError
+from physhandi.progress import NullProgress
+
+
+def scored(error: float | None) -> dict[str, Any]:
+    of_split = {"chamfer_l1_mm": error, "track_error_mm": error}
+    return {"search_seed": 1, "fitted": of_split, "predicted": of_split}
+
+
+def test_a_made_scene_is_captured_imported_and_scored(tmp_path: Path) -> None:
+    order = CaptureOrder(frames=3, image_size="half", resolution="tiny", fit="none")
+    place = ScenePlace(tmp_path, "cloth/lift", order.seed)
+    capture.make_scene(place, "cloth/lift", order, NullProgress())
+    found = capture.import_scene(place, NullProgress()) | capture.score_import(place)
+    assert found["click"].startswith("camera0,0,")
+    assert found["import"]["peak_memory_mb"] > 50
+    masks = found["masks"]
+    assert masks["against_exact"]["object"] > 0.85
+    # The recording's own masks err on purpose, and less than whoever has to find them.
+    assert 0.9 < masks["recording_against_exact"]["object"] < 1.0
+    assert found["cameras"]["shift_mm"] < 3.0
+    assert found["cameras"]["turn_deg"] < 0.3
+    assert found["tracks"]["points"] > 100
+    assert found["tracks"]["median_mm"] < 5.0
+    assert len(found["tracks"]["least_by_view"]) == 3
+    assert set(capture.reached(found)) == set(capture.GOALS) - {"chamfer_ratio"}
+
+
+def test_the_ratio_is_that_of_mean_errors_and_unknown_if_a_fit_is_not_scored() -> None:
+    fits = {"import": [scored(9.0), scored(11.0)], "exact": [scored(8.0), {"error": "diverged"}]}
+    assert capture.ratios(fits)["fitted"] == {"chamfer_l1": 1.25, "track_error": 1.25}
+    fits["exact"] = [scored(None)]
+    assert capture.ratios(fits)["predicted"]["chamfer_l1"] is None
+    assert capture.ratios({"import": [], "exact": []})["fitted"]["chamfer_l1"] is None
+
+
+def test_a_scene_that_fails_is_named_and_costs_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measured(scene: str, folder: Path, order: CaptureOrder, _steps: object) -> dict[str, Any]:
+        if scene == "rope/lift":
+            raise RunError("import: nothing is seen.")
+        time.sleep(0.01)
+        return {"folder": folder.name, "seed": order.seed}
+
+    monkeypatch.setattr(capture, "_measured", measured)
+    arguments = ["benchmark", "capture", "--scenes", "rope/lift", "cloth/fold", "--seed", "3"]
+    out = tmp_path / "out"
+    arguments += ["--jobs", "2", "--fit", "none", "--device", "cpu", "--json", "--out", str(out)]
+    with pytest.raises(SystemExit) as end:
+        cli.main(arguments)
+    assert end.value.code == 1
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
+    assert result["scenes"] == {"cloth/fold": {"folder": "cloth_fold", "seed": 3}}
+    assert result["failed"] == {"rope/lift": "import: nothing is seen."}
+    assert "rope/lift: failed: import: nothing is seen." in printed.err
+    assert json.loads((out / "capture.json").read_text()) == result
+    assert {"commit", "processor", "device_name", "goals"} <= set(result)
+    unknown = ["benchmark", "capture", "--scenes", "rope/knot", "--out", str(tmp_path / "new")]
+    for wrong, told in ((arguments, "holds something"), (unknown, "There is no scene 'rope/knot'")):
+        with pytest.raises(SystemExit) as end:
+            cli.main(wrong)
+        assert end.value.code == 2
+        assert told in capsys.readouterr().err
