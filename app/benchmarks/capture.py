@@ -31,7 +31,7 @@ from physhandi.data.view import View
 from physhandi.errors import CancelledError, PhysHandiError, RunError, UsageError, describe
 from physhandi.progress import PrintedProgress, Progress
 
-GOALS: Mapping[str, float] = {
+CAPTURE_GOALS: Mapping[str, float] = {
     "object_iou": 0.85,
     "hand_iou": 0.80,
     "track_median_mm": 5.0,
@@ -97,8 +97,8 @@ def benchmark_capture(
         jobs: Scenes at a time.
 
     Returns:
-        The machine, the order, for each scene its figures with `GOALS` that are `reached`, and
-        why others `failed`.
+        The machine, the order, for each scene its figures and which `CAPTURE_GOALS` are `reached`,
+        and why others `failed`.
 
     Raises:
         UsageError: If a scene is unknown, named twice, or the folder is not empty.
@@ -118,7 +118,7 @@ def benchmark_capture(
         "processor": processor_name(),
         "jobs": jobs,
         **asdict(order),
-        "goals": dict(GOALS),
+        "goals": dict(CAPTURE_GOALS),
         "scenes": {},
         "failed": {},
     }
@@ -317,7 +317,7 @@ def ratios(fits: Mapping[str, Many[Mapping[str, Any]]]) -> dict[str, dict[str, f
 
 
 def reached(found: Mapping[str, Any]) -> dict[str, bool]:
-    """Tell which of `GOALS` a scene's figures reach; those of fits only if there were fits."""
+    """Tell which of `CAPTURE_GOALS` a scene's figures reach; without fits, not that of fits."""
     values: dict[str, float | None] = {
         "object_iou": found["masks"]["against_exact"]["object"],
         "hand_iou": found["masks"]["against_exact"]["hand"],
@@ -330,7 +330,7 @@ def reached(found: Mapping[str, Any]) -> dict[str, bool]:
         values["chamfer_ratio"] = found["ratio"]["fitted"]["chamfer_l1"]
     return {
         name: value is not None
-        and (value >= GOALS[name] if name in _AT_LEAST else value <= GOALS[name])
+        and (value >= CAPTURE_GOALS[name] if name in _AT_LEAST else value <= CAPTURE_GOALS[name])
         for name, value in values.items()
     }
 

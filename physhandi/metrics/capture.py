@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from physhandi.metrics.photometric import overlap
+from physhandi.metrics.photometric import intersection_over_union
 from physhandi.metrics.truth_metrics import TrueSurface, track_truth
 
-OBJECT_LABEL = 1
+_OBJECT = 1
 """Mask value of the object; those above are hands."""
 FAR_OFF = 0.010
 """Error from which on a track is lost [m]."""
@@ -34,8 +34,8 @@ def mask_scores(
     """
     each = [
         (
-            overlap(one == OBJECT_LABEL, other == OBJECT_LABEL),
-            overlap(one > OBJECT_LABEL, other > OBJECT_LABEL),
+            intersection_over_union(one == _OBJECT, other == _OBJECT),
+            intersection_over_union(one > _OBJECT, other > _OBJECT),
         )
         for one, other in zip(found, true, strict=True)
     ]

@@ -6,12 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from synthetic_world import lifted_sheet
 
 from app import cli
 from app.benchmarks import capture
 from app.benchmarks.capture import CaptureOrder, ScenePlace
 from physhandi.errors import RunError
-from physhandi.progress import NullProgress
+from physhandi.progress import NullProgress, Progress
+from physhandi.synthetic import synthesize
+from physhandi.synthetic.engines.truth import PhysicalTruth
+from physhandi.synthetic.suite import suite
+from physhandi.synthetic.suite.suite import Making, make_recording
 
 
 def scored(error: float | None) -> dict[str, Any]:
@@ -19,7 +24,18 @@ def scored(error: float | None) -> dict[str, Any]:
     return {"search_seed": 1, "fitted": of_split, "predicted": of_split}
 
 
-def test_a_made_scene_is_captured_imported_and_scored(tmp_path: Path) -> None:
+def test_a_made_scene_is_captured_imported_and_scored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # MuJoCo would take 12 s to have a hand reach for the smallest cloth.
+    def lifted(*_scripted: object, frame_count: int, **_how: object) -> PhysicalTruth:
+        return lifted_sheet(frame_count)
+
+    def with_two_cameras(making: Making, target: Path, progress: Progress) -> None:
+        make_recording({**making, "cameras": 2}, target, progress)
+
+    monkeypatch.setattr(synthesize, "simulate_truth", lifted)
+    monkeypatch.setattr(suite, "make_recording", with_two_cameras)
     order = CaptureOrder(frames=3, image_size="half", resolution="tiny", fit="none")
     place = ScenePlace(tmp_path, "cloth/lift", order.seed)
     capture.make_scene(place, "cloth/lift", order, NullProgress())
@@ -34,8 +50,8 @@ def test_a_made_scene_is_captured_imported_and_scored(tmp_path: Path) -> None:
     assert found["cameras"]["turn_deg"] < 0.3
     assert found["tracks"]["points"] > 100
     assert found["tracks"]["median_mm"] < 5.0
-    assert len(found["tracks"]["least_by_view"]) == 3
-    assert set(capture.reached(found)) == set(capture.GOALS) - {"chamfer_ratio"}
+    assert len(found["tracks"]["least_by_view"]) == 2
+    assert set(capture.reached(found)) == set(capture.CAPTURE_GOALS) - {"chamfer_ratio"}
 
 
 def test_the_ratio_is_that_of_mean_errors_and_unknown_if_a_fit_is_not_scored() -> None:
