@@ -132,11 +132,12 @@ def along_the_table(
     Returns:
         What maps the world of the first to that of the second.
     """
-    moment = sum(t[:3, :3] @ f[:3, :3].T for f, t in zip(found, true, strict=True))
+    pairs = list(zip(found, true, strict=True))
+    moment = np.sum([t[:3, :3] @ f[:3, :3].T for f, t in pairs], axis=0)
     yaw = np.arctan2(moment[1, 0] - moment[0, 1], moment[0, 0] + moment[1, 1])
     place = np.eye(4)
     place[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    off = [t[:3, 3] - place[:3, :3] @ f[:3, 3] for f, t in zip(found, true, strict=True)]
+    off = [t[:3, 3] - place[:3, :3] @ f[:3, 3] for f, t in pairs]
     place[:2, 3] = np.mean(off, axis=0)[:2]
     place[2, 3] = rise
     return place

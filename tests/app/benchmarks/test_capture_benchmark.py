@@ -62,6 +62,37 @@ def test_the_ratio_is_that_of_mean_errors_and_unknown_if_a_fit_is_not_scored() -
     assert capture.ratios({"import": [], "exact": []})["fitted"]["chamfer_l1"] is None
 
 
+def test_a_fit_that_fails_is_told_beside_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, ...]] = []
+    figures = {
+        "masks": {"against_exact": {"object": 0.9, "hand": 0.7}},
+        "tracks": {"median_mm": 3.0, "least": 400, "least_by_view": [260, 140]},
+        "cameras": {"shift_mm": 1.0, "turn_deg": 0.4},
+    }
+
+    class Steps(capture._Steps):  # its processes are what is left out
+        def do(self, scene: str, step: str, **about: Any) -> dict[str, Any]:
+            given, seed = about.get("given", ""), about.get("search_seed", "")
+            asked.append((step, given, str(seed), str(about.get("reference_seed", ""))))
+            if (step, given, seed) == ("fit", "exact", 5):
+                raise RunError("fit exact 5: all candidates diverged.")
+            of_step = {"score": figures, "score_fit": scored(9.0 if given == "import" else 6.0)}
+            return {**of_step.get(step, {}), "step_seconds": 1.0}
+
+    order = CaptureOrder(search_seeds=(5, 7))
+    found = capture._measured("cloth/lift", tmp_path, order, Steps(1))
+    assert found["fits"]["exact"][0]["error"] == "fit exact 5: all candidates diverged."
+    assert found["ratio"]["fitted"]["chamfer_l1"] == 1.5
+    # Both are scored against the cloud of the first fit from exact masks that there is.
+    assert {seed for step, *_, seed in asked if step == "score_fit"} == {"7"}
+    assert [name for name, is_reached in found["reached"].items() if not is_reached] == [
+        *("hand_iou", "tracks_alive_in_each_view", "camera_turn_deg", "chamfer_ratio")
+    ]
+    assert json.loads((tmp_path / "capture.json").read_text()) == found
+
+
 def test_a_scene_that_fails_is_named_and_costs_no_other(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
