@@ -1,4 +1,4 @@
-"""What of the viewer can be measured on its own."""
+"""What can be measured on its own, and choices of the benchmarks' commands."""
 
 from typing import Literal, get_args
 
@@ -16,4 +16,8 @@ Part = Literal[
     "splats",
 ]
 """One thing that can be measured on its own."""
+CaptureSize = Literal["half", "full"]
+"""Size of the pictures of a capture: 424x240 or 848x480."""
+FitProfile = Literal["quick", "none"]
+"""Profile of the fits of a capture, or none."""
 PARTS: tuple[Part, ...] = get_args(Part)

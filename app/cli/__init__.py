@@ -39,6 +39,7 @@ def build() -> "SubcommandApp":
         benchmark.batch,
         benchmark.scaling,
         benchmark.splats,
+        benchmark.capture,
         benchmark.substeps,
         benchmark.live,
         benchmark.viewer,

@@ -5,11 +5,12 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from app.benchmarks.parts import PARTS, Part
+from app.benchmarks.parts import PARTS, CaptureSize, FitProfile, Part
 from app.cli.lookup import find_result, sequence_of
 from app.cli.output import AsJson, DataDir, Device, Devices, show
 from physhandi.data.layout import SequenceFiles
 from physhandi.devices import pick_device, pick_devices
+from physhandi.errors import RunError
 
 NodeCount = Annotated[int, arg(name="nodes", help="Object nodes of a made-up block.")]
 Topology = Annotated[
@@ -133,6 +134,53 @@ def splats(
     from physhandi.benchmarks.splats import benchmark_splats
 
     show(benchmark_splats(device=pick_device(device), iterations=iterations), as_json=as_json)
+
+
+def capture(
+    *,
+    out: Path,
+    scenes: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: all of dev_rgbd)")] = (),
+    image_size: CaptureSize = "half",
+    seed: int = 0,
+    frames: int = 60,
+    fit: FitProfile = "quick",
+    search_seeds: tuple[int, ...] = (42, 1),
+    jobs: int = 1,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Measure what one click makes of raw captures: masks, tracks, cameras, and fits from them.
+
+    Made scenes are written as raw captures and imported again. The JSON says for each scene the
+    overlap of masks with the recording's and with exact ones, errors of tracks against the true
+    surface and how many live, errors of cameras, time and memory of the import, and what fits from
+    it reach beside fits from exact masks and tracks (docs/benchmarks). A scene that fails is named
+    and costs no other one.
+
+    Args:
+        out: Folder to fill; it must not be there yet, or be empty.
+        scenes: Scenes of the suite dev_rgbd, like cloth/lift.
+        image_size: Size of the pictures: half is 424x240, full is 848x480.
+        seed: Seed of the scenes.
+        frames: Frames of each.
+        fit: Profile of the fits, or none.
+        search_seeds: Seeds of the searches; each makes two fits.
+        jobs: Scenes that are measured side by side, each in processes of its own.
+    """
+    from app.benchmarks.capture import CaptureOrder, benchmark_capture
+
+    order = CaptureOrder(
+        image_size=image_size,
+        seed=seed,
+        frames=frames,
+        fit=fit,
+        search_seeds=search_seeds,
+        device=pick_device(device),
+    )
+    result = benchmark_capture(scenes, out, order, jobs=jobs)
+    show(result, as_json=as_json)
+    if result["failed"]:
+        raise RunError(f"{len(result['failed'])} scenes failed: {', '.join(result['failed'])}.")
 
 
 def substeps(

@@ -24,6 +24,8 @@ TRUTH_FOLDER = "truth"
 """Folder of a sequence that holds the truth."""
 HELD_OUT_FOLDER = f"{TRUTH_FOLDER}/views"
 """Folder of a sequence that holds the views that are held out."""
+ANNOTATION_FOLDER = f"{TRUTH_FOLDER}/annotation"
+"""Folder of a sequence that may hold masks and tracks of each view without any error."""
 HELD_OUT_CAMERA = "camera.yaml"
 """File of such a view that holds its calibration, in the fields that ``sequence.yaml`` has."""
 _SIDES: tuple[Side, Side] = ("right", "left")

@@ -80,7 +80,7 @@ def phystwin_scores(
     """
     is_object, is_hand = mask == OBJECT, mask > OBJECT
     is_drawn = (np.rint(_FULL * np.clip(alpha, 0.0, 1.0)) > 0) & ~is_hand
-    iou = _iou(is_object, is_drawn)
+    iou = intersection_over_union(is_object, is_drawn)
     if recorded is None:
         return ImageScores(psnr=float("nan"), ssim=float("nan"), iou=iou)
     seen = _on_black(recorded / _FULL, is_object)
@@ -123,7 +123,7 @@ def proper_scores(
     is_object = mask == OBJECT
     is_drawn = (alpha >= LEAST_ALPHA) & (mask <= OBJECT)
     is_counted = is_object | is_drawn
-    iou = _iou(is_object, is_drawn)
+    iou = intersection_over_union(is_object, is_drawn)
     if recorded is None or not is_counted.any():
         return ImageScores(psnr=float("nan"), ssim=float("nan"), iou=iou)
     rows, columns = _box(is_counted)
@@ -184,7 +184,9 @@ def _on_black(
     return np.where(where[..., None], image, 0.0).astype(np.float64)
 
 
-def _iou(one: Bool[ndarray, "row column"], other: Bool[ndarray, "row column"]) -> float:
+def intersection_over_union(
+    one: Bool[ndarray, "row column"], other: Bool[ndarray, "row column"]
+) -> float:
     """Compute intersection over union; NaN if both are empty."""
     either = int((one | other).sum())
     return int((one & other).sum()) / either if either else float("nan")

@@ -132,20 +132,56 @@ def true_motion(
         node: Nodes in frame 0, of whatever spacing [m].
         surface: The true surface, which has a triangle with an area.
     """
-    start = surface.point[0].astype(np.float64)
+    mine, own = _held_by(node.astype(np.float64), surface, 0)
+    return _carried(mine, own, surface)
+
+
+def track_truth(
+    point: Float[ndarray, "frame track 3"], surface: TrueSurface
+) -> Float[ndarray, "frame track 3"]:
+    """Find where the surface points that tracks began on truly are in every frame [m].
+
+    A track begins in the first frame in which its place is known, on the point of the plane of the
+    nearest triangle that is nearest to it, and has to stay there: what it is off later is an error.
+
+    Args:
+        point: Tracks in the world [m]; NaN where not known. One that is never known has no truth.
+        surface: The true surface, of at least as many frames.
+    """
+    is_known = np.isfinite(point).all(axis=-1)
+    first, begins = is_known.argmax(axis=0), is_known.any(axis=0)
+    truth = np.full(point.shape, np.nan)
+    for frame in np.unique(first[begins]):
+        tracks = np.flatnonzero(begins & (first == frame))
+        mine, own = _held_by(point[frame, tracks].astype(np.float64), surface, int(frame))
+        own[:, 2] = 0.0  # On the surface, not as far from it as was measured.
+        truth[:, tracks] = _carried(mine, own, surface)[: len(point)]
+    return truth
+
+
+def _held_by(
+    place: Float[ndarray, "node 3"], surface: TrueSurface, frame: int
+) -> tuple[Int[ndarray, "node 3"], Float[ndarray, "node 3 1"]]:
+    """Find the triangle nearest to each place in a frame, and where the place is in its axes."""
+    start = surface.point[frame].astype(np.float64)
     face = surface.face[triangle_areas(start, surface.face) > 0.0]
-    corner, place = start[face], node.astype(np.float64)
+    corner = start[face]
     count = min(CANDIDATES, len(face))
     tree: Any = KDTree(corner.mean(axis=1))
     near = np.reshape(tree.query(place, k=count)[1], (len(place), count))
     nearest = triangle_distance(place[:, None], corner[near]).argmin(axis=1)
     mine = face[near[np.arange(len(place)), nearest]]
-    origin, frame = _frames(start[mine])
-    own = np.linalg.solve(frame, (place - origin)[..., None])
-    moved = np.empty((len(surface.point), *place.shape))
+    origin, axes = _frames(start[mine])
+    return mine, np.linalg.solve(axes, (place - origin)[..., None])
+
+
+def _carried(
+    mine: Int[ndarray, "node 3"], own: Float[ndarray, "node 3 1"], surface: TrueSurface
+) -> Float[ndarray, "frame node 3"]:
+    moved = np.empty((len(surface.point), len(mine), 3))
     for number, point in enumerate(surface.point):
-        origin, frame = _frames(point[mine].astype(np.float64))
-        moved[number] = origin + (frame @ own)[..., 0]
+        origin, axes = _frames(point[mine].astype(np.float64))
+        moved[number] = origin + (axes @ own)[..., 0]
     return moved
 
 

@@ -202,6 +202,23 @@ def _what_is_missing(sequence: Sequence, subject: str) -> str:
     )
 
 
+def lifted_tracks(view: View) -> Float[ndarray, "frame track 3"]:
+    """Lift the tracks of a view in all frames, as `observe_object` does.
+
+    Args:
+        view: View with depth and masks.
+
+    Returns:
+        Where tracks are in the world [m]; NaN where they are not seen or cannot be lifted.
+    """
+    return np.stack(
+        [
+            _lift_tracks(view, frame, view.depth(frame), view.mask(frame) == OBJECT_LABEL)
+            for frame in range(view.frame_count)
+        ]
+    )
+
+
 def _lift_tracks(
     view: View, frame: int, depth: ndarray, is_object: ndarray
 ) -> Float[ndarray, "track 3"]:

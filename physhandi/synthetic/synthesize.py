@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -60,10 +60,12 @@ def synthesize(
     images: Images = "all",
     image_size: ImageSize = "full",
     held_out_view: bool = False,
+    exact_annotation: bool = False,
     resolution: Resolution = "fine",
     changes: Mapping[str, float] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    device: str = "cpu",
 ) -> Sequence:
     """Simulate hands that handle a soft body, film it, and write the sequence with its truth.
 
@@ -88,10 +90,14 @@ def synthesize(
             pixels stay those of the full picture, as if detectors had seen that.
         held_out_view: Whether one more camera, halfway between the first two, films without errors
             for scoring alone (`Sequence.held_out_views`). The others stay as they are.
+        exact_annotation: Whether `truth/` gets the masks and tracks of all views without any error.
+            It changes no other file.
         resolution: How many nodes the body gets; ``tiny`` is for tests.
         changes: Levels that differ from the preset's, by name.
         overwrite: Whether to replace a sequence that is there.
         progress: Told after every frame; may ask to stop.
+        device: Warp device that draws pictures. Graphics cards see the same but for pixels in which
+            two surfaces are equally near.
 
     Returns:
         The finished, validated sequence.
@@ -130,7 +136,7 @@ def synthesize(
         # Or all sequences of a seed would share the errors of one calibration.
         place = [seed, 2, get_args(BodyName).index(name), ACTIONS.index(action)]
         own = int(np.random.default_rng(place).integers(2**32))
-        stage = make_filmed_scene(truth, hands, level, own)
+        stage = replace(make_filmed_scene(truth, hands, level, own), device=device)
         extent = stage.extent()
         given = make_viewpoints(extent, cameras, level, own)
         views = tuple(with_image_size(view, image_size) for view in given)
@@ -143,6 +149,7 @@ def synthesize(
             seed=own,
             images=images,
             held_out=[with_image_size(view, image_size) for view in held_out],
+            exact_annotation=exact_annotation,
             progress=progress,
         )
         settings = {

@@ -64,6 +64,8 @@ class FilmedScene:
     """Hands, the right one first."""
     frame_rate: float
     """Frames per second [Hz]."""
+    device: str = "cpu"
+    """Warp device that draws it."""
 
     @property
     def frame_count(self) -> int:
@@ -104,6 +106,7 @@ class FilmedScene:
             ],
             dye=_DYES.get(self.name),
             light=light_camera(800, 1800.0),
+            device=self.device,
         )
 
 

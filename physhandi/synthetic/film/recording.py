@@ -15,7 +15,7 @@ from numpy.random import Generator
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.data.truth import HELD_OUT_CAMERA, HELD_OUT_FOLDER
+from physhandi.data.truth import ANNOTATION_FOLDER, HELD_OUT_CAMERA, HELD_OUT_FOLDER
 from physhandi.perception.tracks import motion_validity
 from physhandi.progress import Progress
 from physhandi.synthetic.film.cameras import SIZE, Viewpoint, window_around
@@ -72,6 +72,7 @@ def record(
     seed: int,
     images: Images,
     held_out: Sequence[Viewpoint] = (),
+    exact_annotation: bool = False,
     progress: Progress,
 ) -> None:
     """Write all files of a recording but ``sequence.yaml``.
@@ -85,6 +86,8 @@ def record(
         images: ``all`` writes color, depth, masks and pixel tracks; ``none`` leaves the images out
             and writes the tracks lifted into the world as markers.
         held_out: Cameras whose color, depth and masks, without any error, are for scoring alone.
+        exact_annotation: Whether to write the masks and tracks of `views` without any error, too,
+            for scoring alone.
         progress: Receives a report after every frame of every view; may cancel.
 
     Raises:
@@ -97,8 +100,13 @@ def record(
         folder = f"views/{view.name}"
         counter = _Counter(progress, stage.frame_count, number, len(views) + len(held_out))
         if images == "all":
-            colors = _film(writer, folder, shot, counter)
+            exact = f"{ANNOTATION_FOLDER}/{view.name}" if exact_annotation else None
+            colors = _film(writer, folder, shot, counter, exact)
             save_video(writer, f"{folder}/color.mp4", colors, stage.frame_rate)
+            if exact is not None:
+                pixel, is_seen = shot.exact_tracks()
+                writer.save_array(f"{exact}/track.npy", pixel)
+                writer.save_array(f"{exact}/track_visible.npy", is_seen)
             reported, visible = shot.tracks()
             writer.save_array(f"{folder}/track.npy", reported)
             writer.save_array(f"{folder}/track_visible.npy", visible)
@@ -113,10 +121,10 @@ def record(
         is_visible = np.asarray(np.isfinite(marker).all(axis=-1))
         writer.save_array("marker.npy", marker.astype(np.float32))
         writer.save_array("marker_motion_valid.npy", motion_validity(marker, is_visible))
-    exact = replace(stage, hands=tuple(hand.in_place() for hand in stage.hands))
+    in_place = replace(stage, hands=tuple(hand.in_place() for hand in stage.hands))
     for number, view in enumerate(held_out, len(views)):
         folder = f"{HELD_OUT_FOLDER}/{view.name}"
-        shot = Shot(exact, view, Degradations(), np.random.default_rng([seed, 30, number]))
+        shot = Shot(in_place, view, Degradations(), np.random.default_rng([seed, 30, number]))
         counter = _Counter(progress, stage.frame_count, number, len(views) + len(held_out))
         colors = _film(writer, folder, shot, counter)
         save_video(writer, f"{folder}/color.mp4", colors, stage.frame_rate)
@@ -215,6 +223,11 @@ class Shot:
             dropout_rate=self.level.track_loss,
         )
 
+    def exact_tracks(self) -> tuple[Float[ndarray, "frame point 2"], Bool[ndarray, "frame point"]]:
+        """Tell where the tracked points are in the picture, and whether they are seen."""
+        pixel = self.view.camera.project(self._path())
+        return pixel.astype(np.float32), np.stack(self._is_seen)
+
     def lifted_tracks(self) -> Float[ndarray, "frame point 3"]:
         """Lift the tracks by the depth that the camera measures [m]; NaN where not seen.
 
@@ -254,11 +267,19 @@ class _Counter:
 
 
 def _film(
-    writer: SequenceWriter, folder: str, shot: Shot, counter: _Counter
+    writer: SequenceWriter,
+    folder: str,
+    shot: Shot,
+    counter: _Counter,
+    exact: str | None = None,
 ) -> Iterator[UInt8[ndarray, "row column 3"]]:
-    """Write depth and masks of a view frame by frame, and yield its color images."""
+    """Write depth and masks of a view frame by frame, and yield its color images.
+
+    Masks without any error go into the folder `exact`, if it is given.
+    """
     camera = shot.view.camera
-    background = paint(camera, compose(_EMPTY, _EMPTY.astype(np.int64), _EMPTY[:, :2], []))
+    no_faces, device = _EMPTY.astype(np.int64), shot.stage.device
+    background = paint(camera, compose(_EMPTY, no_faces, _EMPTY[:, :2], [], device=device))
     around = np.ones((2 * KEPT_AROUND + 1,) * 2, dtype=np.uint8)
     for frame in range(shot.stage.frame_count):
         counter.check()
@@ -274,10 +295,12 @@ def _film(
         limit = shot.scale * shot.level.mask_error
         mask = shift_outlines(picture.label, shot.random, error=limit / 2, largest=limit)
         depth[cv2.dilate((mask > 0).astype(np.uint8), around) == 0] = 0
-        for kind, part in (("depth", depth), ("mask", mask)):
+        parts = [(f"{folder}/depth", depth), (f"{folder}/mask", mask)]
+        parts += [] if exact is None else [(f"{exact}/mask", picture.label)]
+        for place, part in parts:
             whole = np.zeros((camera.height, camera.width), dtype=part.dtype)
             whole[window.rows, window.columns] = part
-            writer.save_image(f"{folder}/{kind}/{frame:05d}.png", whole)
+            writer.save_image(f"{place}/{frame:05d}.png", whole)
         counter.done(frame, shot.view.name)
         yield _color(shot, scene, background)
 

@@ -66,6 +66,8 @@ class Scene:
     """Colors of the body."""
     light: PinholeCamera = field(default_factory=light_camera)
     """What the light sees; see `light_camera`."""
+    device: str = "cpu"
+    """Warp device that draws it."""
 
     @property
     def surface(self) -> Surface:
@@ -100,6 +102,7 @@ def compose(
     *,
     dye: Dye | None = None,
     light: PinholeCamera | None = None,
+    device: str = "cpu",
 ) -> Scene:
     """Put a body and hands into one scene.
 
@@ -110,6 +113,7 @@ def compose(
         hands: Mask value, vertices [m] and triangles of each hand.
         dye: Colors of the body.
         light: What the light sees.
+        device: Warp device that draws it.
     """
     vertex, triangles = [body], [faces]
     label = [np.full(len(faces), _BODY, dtype=np.uint8)]
@@ -125,12 +129,13 @@ def compose(
         np.concatenate([pattern, unused]),
         dye or Dye(),
         light or light_camera(),
+        device,
     )
 
 
 def photograph(camera: PinholeCamera, scene: Scene) -> Picture:
     """Render depth, labels and viewing angles of a scene."""
-    raster = rasterize(camera, [scene.surface])
+    raster = rasterize(camera, [scene.surface], device=scene.device)
     point, sight = _points(camera, raster)
     normal = _normals(scene, raster)
     return Picture(
@@ -151,7 +156,7 @@ def paint(
         samples: Each pixel is averaged over this many rows and columns.
     """
     fine = resized(camera, samples)
-    raster = rasterize(fine, [scene.surface])
+    raster = rasterize(fine, [scene.surface], device=scene.device)
     point, sight = _points(fine, raster)
     normal = _normals(scene, raster)
     facing = np.einsum("rcd,rcd->rc", normal, sight)
@@ -208,7 +213,7 @@ def _albedo(scene: Scene, raster: Raster, point: ndarray, facing: ndarray) -> nd
 def _lit(scene: Scene, point: Float[ndarray, "row column 3"]) -> Float[ndarray, "row column"]:
     """Tell how much of the light reaches each point past body and hands."""
     light = scene.light
-    reach = rasterize(light, [scene.surface]).depth
+    reach = rasterize(light, [scene.surface], device=scene.device).depth
     reach = np.where(reach > 0, reach, np.inf) + _SHADOW_BIAS
     where = np.nan_to_num(point)
     # Far away the table is behind the light; nothing casts a shadow there.

@@ -20,8 +20,9 @@ from physhandi.data.files import named_fields
 from physhandi.data.sequence import ARRAYS, Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.data.truth import read_truth
+from physhandi.data.truth import ANNOTATION_FOLDER, read_truth
 from physhandi.data.untrusted.image_header import announced_size
+from physhandi.data.view import View
 from physhandi.errors import MissingInputError
 from physhandi.synthetic.code_version import INPUTS, code_version
 
@@ -104,6 +105,39 @@ def one_view(recording: Sequence, _random: Generator) -> VariantChange:
     )
 
 
+def exact_annotation(recording: Sequence, _random: Generator) -> VariantChange:
+    """Replace masks and tracks by those without any error; depth and keypoints stay.
+
+    Raises:
+        MissingInputError: If the recording does not tell them.
+    """
+    images: dict[str, ndarray] = {}
+    arrays: dict[str, ndarray] = {}
+    for view in recording.views:
+        exact = exact_view(recording, view)
+        for frame in range(recording.frame_count):
+            images[f"views/{view.name}/mask/{frame:05d}.png"] = exact.mask(frame)
+        for file, array in (("track", exact.track), ("track_visible", exact.track_visible)):
+            if array is not None:
+                arrays[f"views/{view.name}/{file}.npy"] = array
+    return VariantChange(meta=recording.meta, images=images, arrays=arrays)
+
+
+def exact_view(recording: Sequence, view: View) -> View:
+    """Open a view's masks and tracks without any error, which have the view's calibration.
+
+    Raises:
+        MissingInputError: If the recording does not tell them.
+    """
+    folder = recording.folder / ANNOTATION_FOLDER / view.name
+    if not folder.is_dir():
+        raise MissingInputError(
+            f"Sequence '{recording.name}' has no {ANNOTATION_FOLDER}/{view.name}/, so its masks "
+            "and tracks are not known without errors."
+        )
+    return View(folder, recording.name, view.camera, recording.frame_count)
+
+
 def noisy_depth(recording: Sequence, random: Generator) -> VariantChange:
     """Add the paper's noise to every depth, or along no special axis to markers."""
     images: dict[str, ndarray] = {}
@@ -163,6 +197,7 @@ VARIANTS: dict[str, Callable[[Sequence, Generator], VariantChange]] = {
     "true_hand": true_hand,
     "all_frames": all_frames,
     "one_view": one_view,
+    "exact_annotation": exact_annotation,
     "noisy_depth": noisy_depth,
     "noisy_tracks": noisy_tracks,
     "noisy_hand": noisy_hand,

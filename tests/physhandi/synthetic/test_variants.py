@@ -46,6 +46,10 @@ def recording(tmp_path: Path) -> Sequence:
         for frame in range(FRAMES):
             images[f"views/{view.name}/depth/{frame:05d}.png"] = depth
             images[f"views/{view.name}/mask/{frame:05d}.png"] = mask
+            images[f"truth/annotation/{view.name}/mask/{frame:05d}.png"] = np.minimum(mask, 1)
+        for file in ("track", "track_visible"):
+            exact = arrays[f"views/{view.name}/{file}.npy"][:, :7]
+            arrays[f"truth/annotation/{view.name}/{file}.npy"] = exact
     rise = np.arange(FRAMES, dtype=np.float32)[:, None, None] / 100
     arrays["truth/hand_right_vertex.npy"] = np.ones((FRAMES, 7, 3), np.float32) * 0.1 + rise
     arrays["validation_track.npy"] = np.zeros((FRAMES, 2, 3), np.float32)
@@ -82,6 +86,7 @@ def test_nothing_but_truth_and_origin_is_kept_back(recording: Sequence, tmp_path
     kept_back = {"truth/hand_right_vertex.npy", "validation_track.npy"}
     kept_back |= {f"truth/views/held_out/mask/{frame:05d}.png" for frame in range(FRAMES)}
     kept_back.add("truth/views/held_out/camera.yaml")
+    kept_back |= {file for file in whole if file.startswith("truth/annotation/")}
     assert set(whole) - set(given) == kept_back
     assert [name for name in given if given[name] != whole[name]] == ["sequence.yaml"]
     assert made.meta.to_dict() == {
@@ -108,6 +113,22 @@ def test_no_variant_tells_the_future_or_how_it_was_made(
         assert told in files(recording)["sequence.yaml"]
         assert told not in given["sequence.yaml"]
     assert b"ground_height: 0.25" in given["sequence.yaml"]
+
+
+def test_exact_masks_and_tracks_take_the_place_of_those_with_errors_and_nothing_else_does(
+    recording: Sequence, tmp_path: Path
+) -> None:
+    made = make_variant(recording, "exact_annotation", tmp_path / "inputs")
+    before, after = files(recording), files(made)
+    changed = {file for file in after if after[file] != before[file]} - {"sequence.yaml"}
+    assert {file.split("/")[2] for file in changed} == {"mask", "track.npy", "track_visible.npy"}
+    assert set(np.unique(made.views[1].mask(2))) == {0, 1}
+    track = made.views[0].track
+    assert track is not None
+    assert track.shape == (FRAMES, 7, 2)
+    (recording.folder / "truth/annotation").rename(tmp_path / "gone")
+    with pytest.raises(MissingInputError, match="not known without errors"):
+        make_variant(Sequence.load(recording.folder), "exact_annotation", tmp_path / "other")
 
 
 def test_what_other_code_made_is_not_used_again(
