@@ -117,7 +117,7 @@ def settings_of(profile: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
     return apply_overrides(load_profile(profile), overrides).to_dict()
 
 
-def reconstruct(
+def run_reconstruction(
     sequences: Many[Sequence],
     config: PipelineConfig,
     attempt: Attempt,
@@ -213,7 +213,7 @@ def predict(
     _finish(attempt, EVALUATION, [], [], [])
 
 
-def simulate(
+def run_simulation(
     source: RunFolder,
     sequences: Many[Sequence],
     changes: Mapping[str, Any],
@@ -881,7 +881,7 @@ def run_job(
             source = RunFolder.open(Path(run.asked("source", str)))
             changes = run.asked("parameters", dict[str, Any])
             edits = read_edits(run.folder / EDITS_FILE) if "edits" in run.config else None
-            simulate(
+            run_simulation(
                 source,
                 sequences,
                 changes,
@@ -893,7 +893,7 @@ def run_job(
             )
         else:
             config = PipelineConfig.from_dict(run.asked("profile", dict[str, Any]))
-            reconstruct(
+            run_reconstruction(
                 sequences, config, attempt, watched, device=device, more_devices=more_devices
             )
         attempt.publish(store)

@@ -321,7 +321,7 @@ def execute(
             )
         config = pipeline.PipelineConfig.from_dict(settings)
         if method.rule is None:
-            pipeline.reconstruct([recording], config, attempt, watched, device=device)
+            pipeline.run_reconstruction([recording], config, attempt, watched, device=device)
         else:
             rule = partial(_moved, rule=method.rule, truth=truth)
             pipeline.predict(recording, config, rule, attempt, watched)
