@@ -490,12 +490,12 @@ def loading_modules() -> Generator[None]:
     It stays until the process ends. Searches were a quarter of the time that torch, Warp and SciPy
     take to load.
     """
-    known, searches = len(sys.modules), gc.isenabled()
+    module_count, searches = len(sys.modules), gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if len(sys.modules) > known:
+        if len(sys.modules) > module_count:
             gc.freeze()
         if searches:
             gc.enable()

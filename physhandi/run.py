@@ -19,14 +19,14 @@ def warnings_in(metrics: Mapping[str, Any]) -> list[dict[str, str]]:
     Returns:
         For each ``sequence code message``.
     """
-    found: list[dict[str, str]] = []
+    collected: list[dict[str, str]] = []
     for name, scores in metrics.items():
         listed = (named_fields(scores) or {}).get("warnings")
         for warning in cast("list[Any]", listed) if isinstance(listed, list) else []:
             fields = named_fields(warning) or {}
             texts = {key: str(fields.get(key, "")) for key in ("code", "message")}
-            found.append({"sequence": name, **texts})
-    return found
+            collected.append({"sequence": name, **texts})
+    return collected
 
 
 class Run(RunFolder):

@@ -144,9 +144,9 @@ def read_meta(folder: Path) -> SequenceMeta:
 def parse_meta(content: Any, where: str) -> SequenceMeta:
     """Check the content of ``sequence.yaml``; `where` starts each message."""
     fields = _Fields(content, f"{where}: {FILE}")
-    found = fields.take("format", str)
-    if found != FORMAT:
-        fields.fail("format", found, f"{FORMAT!r}; this version reads no other")
+    file_format = fields.take("format", str)
+    if file_format != FORMAT:
+        fields.fail("format", file_format, f"{FORMAT!r}; this version reads no other")
     frame_count = fields.whole("frame_count", least=1, most=_MOST_FRAMES)
     split = _Fields(fields.take("split", dict, {}), f"{where}: {FILE}: split")
     default = default_reconstruction_count(frame_count)

@@ -499,7 +499,7 @@ def _profile_file(path: Path, extended: tuple[Path, ...] = ()) -> PipelineConfig
         )
     config = PipelineConfig.from_dict(merged)
     if clashes := _clashes(config):
-        raise SettingsError({place: f"{path}: {told}" for place, told in clashes.items()})
+        raise SettingsError({place: f"{path}: {message}" for place, message in clashes.items()})
     return config
 
 

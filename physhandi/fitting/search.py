@@ -46,8 +46,8 @@ class SearchResult:
         """What the search did beyond its settings, in a sentence; empty if nothing."""
         if not self.widened:
             return ""
-        told = (f"{name} to {interval_text(name, self.intervals[name])}" for name in self.widened)
-        return f"Ended at a bound and went on with wider intervals: {', '.join(told)}."
+        texts = (f"{name} to {interval_text(name, self.intervals[name])}" for name in self.widened)
+        return f"Ended at a bound and went on with wider intervals: {', '.join(texts)}."
 
 
 def search_parameters(

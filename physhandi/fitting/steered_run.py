@@ -102,9 +102,9 @@ def contacts_from(contacts: ContactIntervals | None, frame: int) -> ContactInter
     """
     if contacts is None:
         return None
-    kept = acts_in(contacts.interval, frame + 1)
-    part = {field.name: getattr(contacts, field.name)[kept] for field in fields(contacts)}
-    return ContactIntervals(**part | {"interval": always(int(kept.sum()))})
+    holds = acts_in(contacts.interval, frame + 1)
+    part = {field.name: getattr(contacts, field.name)[holds] for field in fields(contacts)}
+    return ContactIntervals(**part | {"interval": always(int(holds.sum()))})
 
 
 def contacts_in(model: SpringMassModel) -> ContactIntervals:

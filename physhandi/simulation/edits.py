@@ -452,13 +452,13 @@ def _with_springs(model: SpringMassModel, place: int, new: dict[str, ndarray]) -
 
 def _without(model: SpringMassModel, removed: Bool[ndarray, " spring"]) -> SpringMassModel:
     """Leave springs out."""
-    kept, own = ~removed, model.object_spring_count
+    stays, own = ~removed, model.object_spring_count
     return replace(
         model,
-        spring_nodes=model.spring_nodes[kept],
-        rest_length=model.rest_length[kept],
-        stiffness=model.stiffness[kept],
-        damping=model.damping[kept],
-        attached=model.attached[kept[own:]],
-        object_spring_count=int(kept[:own].sum()),
+        spring_nodes=model.spring_nodes[stays],
+        rest_length=model.rest_length[stays],
+        stiffness=model.stiffness[stays],
+        damping=model.damping[stays],
+        attached=model.attached[stays[own:]],
+        object_spring_count=int(stays[:own].sum()),
     )

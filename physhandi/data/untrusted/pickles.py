@@ -435,10 +435,10 @@ class InertUnpickler(pickle.Unpickler):
         Raises:
             ImportFailedError: If it has none.
         """
-        found = self._names.get(module, {}).get(name)
-        if found is None:
+        stand_in = self._names.get(module, {}).get(name)
+        if stand_in is None:
             raise ImportFailedError(f"it asks for {module}.{name}"[:200])
-        return found
+        return stand_in
 
     def persistent_load(self, pid: Any) -> Storage:
         """Read the storage of a torch tensor from the archive.
@@ -587,11 +587,11 @@ def read(source: Path, out: Path, most_bytes: int) -> None:
     with source.open("rb") as stream:
         watched = forbid_calls()
         try:
-            tree, found = convert(stream, most_bytes)
+            tree, arrays = convert(stream, most_bytes)
         finally:
             watched.clear()
-    arrays: Any = {str(number): array for number, array in enumerate(found)}
-    np.savez(out / "array.npz", allow_pickle=False, **arrays)
+    named: Any = {str(number): array for number, array in enumerate(arrays)}
+    np.savez(out / "array.npz", allow_pickle=False, **named)
     (out / "tree.json").write_text(json.dumps(tree), encoding="ascii")
 
 
@@ -746,8 +746,8 @@ def _reader() -> _Reader:
 def _ending(code: int) -> str:
     if code >= 0:
         return f"with exit code {code}"
-    known = {signal.SIGKILL: "for want of memory or time", signal.SIGXCPU: "for want of time"}
-    return known.get(signal.Signals(-code), f"by signal {-code}; it may be nested too deeply")
+    reasons = {signal.SIGKILL: "for want of memory or time", signal.SIGXCPU: "for want of time"}
+    return reasons.get(signal.Signals(-code), f"by signal {-code}; it may be nested too deeply")
 
 
 def _collect(folder: Path) -> Any:

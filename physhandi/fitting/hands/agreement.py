@@ -267,8 +267,8 @@ def _bone_error(ratio: Float[ndarray, "frame bone"]) -> Float[ndarray, " frame"]
     """Take the median of how far logarithms of lengths are from being all alike."""
     error = np.full(len(ratio), np.nan)
     is_known = np.isfinite(ratio).sum(1) >= len(_BONES) // 2
-    known = ratio[is_known]
-    away = np.abs(known - np.nanmedian(known, axis=1, keepdims=True))
+    measured = ratio[is_known]
+    away = np.abs(measured - np.nanmedian(measured, axis=1, keepdims=True))
     error[is_known] = np.nanmedian(away, axis=1)
     return error
 

@@ -147,8 +147,8 @@ def parse_method(text: str) -> Method:
     if base not in METHODS:
         raise UsageError(f"There is no method '{base}'. Choose from: {', '.join(METHODS)}.")
     if correction is not None and correction not in CORRECTIONS:
-        known = " and ".join(f"'+{name}'" for name in CORRECTIONS)
-        raise UsageError(f"Method '{text}' ends in '+{correction}'; only {known} exist.")
+        names = " and ".join(f"'+{name}'" for name in CORRECTIONS)
+        raise UsageError(f"Method '{text}' ends in '+{correction}'; only {names} exist.")
     overrides: dict[str, Any] = {}
     for part in () if settings is None else _split(settings):
         path, equals, value = part.partition("=")
