@@ -406,7 +406,7 @@ def error_of(message: Mapping[str, Any]) -> PhysHandiError:
 
 
 class Channel:
-    """What a child process hears from its parent and tells it."""
+    """Messages between a child process and its parent, as the child sees them."""
 
     def __init__(self) -> None:
         self.arguments = sys.argv[1:]

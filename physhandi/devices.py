@@ -95,7 +95,7 @@ def card_of(name: str) -> str | None:
 
 
 ONLY_CARD = "cuda:0"
-"""How a process calls the one graphics card that it sees; see `only_card`."""
+"""Name of the one graphics card that a process sees; see `only_card`."""
 
 
 def only_card(card: str | None) -> dict[str, str]:

@@ -43,7 +43,7 @@ class Run(RunFolder):
 
     @property
     def warnings(self) -> list[dict[str, str]]:
-        """What there is to doubt about the fit: ``sequence code message`` each (docs/metrics.md).
+        """Warnings about the fit: ``sequence code message`` each (docs/metrics.md).
 
         Empty if there is nothing, if the run has not been measured yet, or if a version measured it
         that looked for no doubts.

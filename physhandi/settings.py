@@ -40,18 +40,18 @@ ValueKind = Literal["number", "whole", "switch", "choice", "text", "settings", "
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """What a class of settings declares about one of its fields."""
+    """Declaration of one field of a class of settings."""
 
     name: str
     """Its name."""
     type: Any
     """Type with bounds, as msgspec checks it."""
     kind: ValueKind
-    """What sort of value it takes; ``settings`` and ``mapping`` hold further fields."""
+    """Kind of its value; ``settings`` and ``mapping`` hold further fields."""
     about: str
-    """What it means, in a sentence."""
+    """Meaning, in a sentence."""
     unit: str
-    """What it is measured in; empty for a mere number."""
+    """Unit; empty for a mere number."""
     low: float | None
     """Lowest value; none if that side is open."""
     high: float | None
@@ -65,7 +65,7 @@ class Field:
     inner: "type[Settings] | None"
     """Class of the settings that it holds, or that each item of its mapping is."""
     notes: tuple[Any, ...]
-    """What else its annotation says."""
+    """Further metadata of its annotation."""
 
     def problem_of(self, value: Any) -> str:
         """Say what a value ought to be if it is wrong; empty if it is right."""
@@ -89,7 +89,7 @@ class Field:
 
     @property
     def wanted(self) -> str:
-        """What values it takes, in words."""
+        """Allowed values, in words."""
         if self.kind in {"settings", "mapping"}:
             return "a mapping of fields"
         if self.kind == "switch":

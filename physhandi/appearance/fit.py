@@ -64,7 +64,7 @@ _SAMPLES = 4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedSplats:
-    """What a fit found."""
+    """Result of a fit of splats."""
 
     splats: Splats
     """The splats."""

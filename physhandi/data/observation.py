@@ -1,4 +1,4 @@
-"""What was seen of the object: tracked points and a cloud per frame."""
+"""Observation of the object: tracked points and a cloud per frame."""
 
 from dataclasses import dataclass
 

@@ -210,7 +210,7 @@ class RunFolder:
 
     @property
     def state(self) -> RunState:
-        """How far the run is."""
+        """State of the run."""
         # Looked for before the lease, which an attempt takes first: one that begins between the two
         # looks has not failed.
         was_begun = bool(attempt_numbers(self.folder))
@@ -227,7 +227,7 @@ class RunFolder:
 
     @property
     def error(self) -> str | None:
-        """What went wrong in a failed run."""
+        """Error of a failed run."""
         if self.state != "failed":
             return None
         end = read_record(self.folder / EXIT, ExitFile) or {}

@@ -50,7 +50,7 @@ class SequenceMeta:
     frame_count: int
     """Number of frames."""
     description: str = ""
-    """What is to be seen, in one or two sentences."""
+    """Description of the recorded scene, in one or two sentences."""
     metric: bool = True
     """Whether lengths are metres; otherwise one unit is whatever `length_unit` says."""
     length_unit: str = "m"
@@ -76,7 +76,7 @@ class SequenceMeta:
     shape: ShapeClass | None = None
     """Kind of object; None if that is to be found from what the first frame shows."""
     mass: float | None = None
-    """What the object weighs [kg]; None if nobody weighed it."""
+    """Mass of the object [kg]; None if nobody weighed it."""
 
     @property
     def reconstruction_count(self) -> int:

@@ -43,7 +43,7 @@ class SearchResult:
 
     @property
     def note(self) -> str:
-        """What the search did beyond its settings, in a sentence; empty if nothing."""
+        """Departures of the search from its settings, in a sentence; empty if there are none."""
         if not self.widened:
             return ""
         texts = (f"{name} to {interval_text(name, self.intervals[name])}" for name in self.widened)

@@ -1,4 +1,4 @@
-"""What a run and a recording hold of a take of steered hands.
+"""Files of a take of steered hands, in a run and in a recording.
 
 A run of kind ``simulation`` that holds a take simulates that in the place of a recording, which is
 made of it first: control points and markers, one at each object node, with its provenance.

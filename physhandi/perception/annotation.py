@@ -44,9 +44,9 @@ from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
 BUILT_IN = "built-in"
-"""What provenance calls masks and tracks that were made here."""
+"""Source of built-in masks and tracks in the provenance."""
 LENGTHS_ALONG = "lengths along it from its ends"
-"""What it says of tracks of a thin object, as of a rope."""
+"""Method of tracks of a thin object in the provenance."""
 _HASH = "model_sha256"
 """What it says of those that a model of the user made here."""
 _UNFINISHED = "unfinished"

@@ -31,7 +31,7 @@ from physhandi.perception.keypoints import KeypointDetector, detect_view
 from physhandi.progress import NullProgress, Progress
 
 HANDS_FORMAT = "physhandi-hands/1"
-"""What a file of results says of itself."""
+"""Format name in a file of results."""
 _SIDES = ("right", "left")
 _MOST_BYTES = 1 << 30
 """Size of the largest file, unpacked, that is read [byte]."""

@@ -12,7 +12,7 @@ from physhandi.data.observation import evenly
 from physhandi.data.view import View
 
 MEASURED_PALMS = "palm_length"
-"""What provenance calls the size of hands by keypoints that are not kept, by view [m]."""
+"""Provenance field of the palm lengths by view, by keypoints that are not stored [m]."""
 PALM_LENGTH = 0.085
 """From wrist to knuckles of a hand between a child's and a large one [m]."""
 PALM_LENGTHS = (0.06, 0.12)

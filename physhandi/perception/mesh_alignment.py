@@ -92,7 +92,7 @@ class Alignment:
 
 
 class SeenSpace:
-    """What all views say of the space around an object in one frame."""
+    """Space around an object in one frame, as all views see it."""
 
     def __init__(self, views: Many[View], frame: int) -> None:
         """Read masks and depth of a frame.

@@ -64,7 +64,7 @@ class ObjectShape:
     thickness: float
     """Median local thickness of what was seen; see `FoundClass` [m]."""
     reason: str
-    """What decided about the kind that was found, in one line."""
+    """Reason for the kind, in one line."""
     spacing: float
     """Distance between neighbouring nodes that was asked for [m]."""
     point_count: int
@@ -76,7 +76,7 @@ class ObjectShape:
 
     @property
     def warnings(self) -> list[dict[str, str]]:
-        """What a user should look at: ``code`` and ``message`` of each.
+        """Warnings for the user: ``code`` and ``message`` of each.
 
         A few points beside the object are no reason; masks are never exact.
         """

@@ -71,7 +71,7 @@ _FACING_SHARE = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class FoundClass:
-    """What kind of object a cloud shows, and how thick it is."""
+    """Kind and thickness of the object that a cloud shows."""
 
     kind: ShapeClass
     """Kind of object."""
@@ -79,7 +79,7 @@ class FoundClass:
     """Median local thickness [m]: height above the ground of a solid, distance between facing
     layers of a shell, width of a rope, spread of the cloud about the surface of a sheet."""
     reason: str
-    """What decided, in one line."""
+    """Reason for the kind, in one line."""
 
 
 def find_class(

@@ -94,7 +94,7 @@ class SteeredHand:
     """Control nodes that move with a wrist, and with the fingers of a hand that has bones."""
 
     name: str
-    """What it is called: ``right``, ``left``, or ``controls`` where there are no hands."""
+    """Name: ``right``, ``left``, or ``controls`` where there are no hands."""
     control: Int[ndarray, " own"]
     """Numbers of its control nodes."""
     wrist: Float[ndarray, " 3"]
@@ -203,7 +203,7 @@ class Take:
     start: NodeState
     """Positions and velocities of the nodes in the first frame [m, m/s]."""
     parameters: SimulationParameters
-    """What it is simulated with."""
+    """Simulation parameters."""
     control: Float32[ndarray, "control 3"]
     """Control nodes where all poses are zero [m]."""
     hands: tuple[SteeredHand, ...]

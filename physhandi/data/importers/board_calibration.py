@@ -127,7 +127,7 @@ class AprilGrid:
 
 
 Board = CharucoTarget | AprilGrid
-"""What may lie on the table."""
+"""Calibration board that may lie on the table."""
 
 
 def parse_board(charuco: str, april_grid: str) -> Board | None:

@@ -84,7 +84,7 @@ _PNG_EFFORT = 2
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
-    """What a recording does not say itself."""
+    """Options of an import: all that the recording does not say itself."""
 
     depth_scale: float | None = None
     """Metres per unit of depth images; a value above 1 is units per metre. None: as recorded."""
@@ -271,7 +271,7 @@ def _origin(given: Path, sources: list[_Source], options: CaptureOptions) -> str
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyedView:
-    """What a view of a recording holds."""
+    """Contents of one view of a recording."""
 
     name: str
     """Name."""
@@ -289,7 +289,7 @@ class SurveyedView:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSurvey:
-    """What a recording holds, by its headers and a few depth images."""
+    """Contents of a recording, by its headers and a few depth images."""
 
     bags: tuple[str, ...] = ()
     """Bags, of which everything else is only known when they are unpacked."""
@@ -304,9 +304,9 @@ class CaptureSurvey:
     board: str = ""
     """Board that the recording names."""
     notes: tuple[str, ...] = ()
-    """What is repaired or assumed."""
+    """Repairs and assumptions, as sentences."""
     problems: tuple[str, ...] = ()
-    """What is missing or wrong, each with what to do; an import would fail."""
+    """Problems with which an import would fail, each with its remedy."""
 
     def to_dict(self) -> dict[str, Any]:
         """Give it as plain data."""

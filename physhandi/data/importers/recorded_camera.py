@@ -55,7 +55,7 @@ _COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordedCamera:
-    """What a recording says about one camera."""
+    """Properties of one camera as a recording stores them."""
 
     path: Path
     """File that says it."""

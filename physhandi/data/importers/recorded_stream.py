@@ -57,7 +57,7 @@ class RecordedStream:
     """Images of one kind that one camera took, in their order."""
 
     kind: StreamKind
-    """What the images show."""
+    """Kind of the images."""
     path: Path
     """Folder of the images, or the video."""
     files: tuple[Path, ...] = ()
@@ -73,7 +73,7 @@ class RecordedStream:
     time: Float[ndarray, " image"] | None = None
     """When each image was taken [s]; None if that is not known."""
     time_source: str = ""
-    """What `time` was read from, for messages."""
+    """Source of `time`, for messages."""
     frame_rate: float | None = None
     """Frames per second that a video states [Hz]."""
 

@@ -67,7 +67,7 @@ class RecordedView:
     depth_scale: float | None = None
     """Metres per unit of depth that the recording states."""
     notes: list[str] = field(default_factory=list[str])
-    """What was assumed, as sentences."""
+    """Assumptions, as sentences."""
 
     @property
     def streams(self) -> tuple[RecordedStream, ...]:

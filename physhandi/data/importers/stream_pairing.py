@@ -30,7 +30,7 @@ class PairedFrames:
     error: tuple[Float[ndarray, " frame"] | None, ...]
     """For each stream how far its image is from the frame's moment [s]; None without times."""
     notes: tuple[str, ...]
-    """What was repaired or assumed, as sentences."""
+    """Repairs and assumptions, as sentences."""
 
     @property
     def count(self) -> int:

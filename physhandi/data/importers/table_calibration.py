@@ -55,7 +55,7 @@ class TablePattern:
     point: Float[ndarray, "place 2"]
     """Where they are, in table coordinates of this view [m]."""
     descriptor: Float32[ndarray, "place 128"]
-    """What they look like."""
+    """SIFT descriptors of these places."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ _PICTURE = ("r", "g", "b")
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """What a file with one flat image announces."""
+    """Header of a file with one flat image."""
 
     width: int
     """Width [px]."""

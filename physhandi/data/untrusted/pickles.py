@@ -78,7 +78,7 @@ class Inert(ABC):
 
 
 class Callee:
-    """What a pickle may call: one function of this module, and nothing of it can be set."""
+    """Function of this module that a pickle may call; no attribute of it can be set."""
 
     __slots__ = ("_function",)
 
@@ -395,7 +395,7 @@ STAND_INS: dict[str, dict[str, Any]] = {
     "chumpy.ch": {"Ch": Ch},
     "chumpy.reordering": {"Select": Select},
 }
-"""What each name in a pickle stands for; any other name is refused."""
+"""Stand-in of each name in a pickle; any other name is refused."""
 TORCH_STAND_INS: dict[str, dict[str, Any]] = {
     "torch": {
         **{f"{name}Storage": ElementType(code) for name, code in _TORCH_CODES.items()},
@@ -408,7 +408,7 @@ TORCH_STAND_INS: dict[str, dict[str, Any]] = {
         "_rebuild_parameter": Callee(_same),
     },
 }
-"""What else a torch checkpoint may name."""
+"""Stand-ins of further names in torch checkpoints."""
 
 
 TEXT_OF_ARCHIVES = zip_text.getregentry()

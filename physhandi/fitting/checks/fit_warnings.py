@@ -73,9 +73,9 @@ class FitWarning:
     """One doubt about a fit."""
 
     code: Code
-    """Which kind of doubt."""
+    """Kind of warning."""
     message: str
-    """What was found, and what to do about it."""
+    """Finding and remedy, for people."""
 
 
 def with_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What each stage of a fit needs of its recordings, and whether they have it.
+"""Inputs that each stage of a fit needs, and whether recordings have them.
 
 The pipeline asks here which stages it runs; so do the command line, the API and the pages, before a
 fit is launched. Only the presence of files is looked at.
@@ -66,7 +66,7 @@ ABOUT: Mapping[str, str] = {
     APPEARANCE: "what the object looks like, as splats that its nodes carry",
     EVALUATION: "a rollout of all frames, and how well it went",
 }
-"""What each stage makes."""
+"""Result of each stage."""
 
 ReadyState = Literal["ready", "not needed", "missing"]
 

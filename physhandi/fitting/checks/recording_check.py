@@ -61,7 +61,7 @@ class Problem:
     level: Level
     """``error``: breaks the format; ``warning``: readable, but a stage gets less than it could."""
     message: str
-    """What is wrong, as a sentence."""
+    """Description of the problem, as a sentence."""
     file: str = ""
     """File or folder below that of the sequence; empty where no single one is to blame."""
     frame: int | None = None
@@ -71,17 +71,17 @@ class Problem:
     field: str = ""
     """Field of ``sequence.yaml``, or place in an array."""
     remedy: str = ""
-    """What to do, as part of a sentence."""
+    """Remedy, as part of a sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingCheck:
-    """What can be done with a recording, and what is wrong with it."""
+    """Readiness of a recording for each stage, and its problems."""
 
     stages: Mapping[str, StageReadiness]
     """A stage's readiness by its name, in the order of the stages."""
     problems: tuple[Problem, ...]
-    """What was found, errors first."""
+    """Problems, errors first."""
 
     @property
     def error(self) -> str | None:

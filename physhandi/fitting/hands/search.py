@@ -51,7 +51,7 @@ _MOST_COST = 50.0
 
 @dataclass(frozen=True, eq=False)
 class SearchedHand:
-    """What a search needs to know of one hand."""
+    """Inputs of the search for one hand."""
 
     cameras: Many[PinholeCamera]
     """Camera of each view."""

@@ -71,7 +71,7 @@ class HalfEdgeColumns:
     place: Int32[ndarray, " slot"]
     """Place of the other end in the block's part of `local_node`; padding ends where it begins."""
     spring: Int32[ndarray, " slot"]
-    """Which spring it is; -1 for padding."""
+    """Number of its spring; -1 for padding."""
 
 
 def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeColumns:

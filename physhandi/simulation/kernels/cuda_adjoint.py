@@ -28,7 +28,7 @@ ADJOINT_LOCALS = 448
 
 @wp.struct
 class SpringAdjoint:
-    """What one spring says of its offset, its stretch, its stiffness and its damping."""
+    """Adjoints of the offset, stretch, stiffness and damping of one spring."""
 
     offset: wp.vec3
     stretch: wp.vec3

@@ -1,4 +1,4 @@
-"""What CUDA offers within and between thread blocks and Warp does not; nothing of it on a CPU."""
+"""CUDA operations within and between thread blocks that Warp lacks; none of them runs on a CPU."""
 
 import warp as wp
 

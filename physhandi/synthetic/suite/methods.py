@@ -55,7 +55,7 @@ CORRECTIONS: dict[str, str] = {
     "last_residual": "The last residual is added.",
     "restart": "Prediction starts from the observed state.",
 }
-"""What can be done to the predicted frames of a method; ends its name."""
+"""Corrections of the predicted frames of a method; ends its name."""
 _NAME = re.compile(
     r"(?P<base>[^@+]*)(@(?P<settings>.*?))?(\+(?P<correction>[A-Za-z]\w*))?", re.DOTALL
 )
@@ -81,7 +81,7 @@ class Method:
     overrides: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings that differ from the profile's."""
     correction: str | None = None
-    """What is done to the predicted frames, one of `CORRECTIONS`; None leaves them."""
+    """Correction of the predicted frames, one of `CORRECTIONS`; None leaves them."""
     seed_of: str = ""
     """The method that this is one of several seeds of; empty if there are not several."""
 
