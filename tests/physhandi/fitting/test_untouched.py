@@ -66,7 +66,7 @@ def moved(model: SpringMassModel, parameters: SimulationParameters, control: np.
 
 ABOVE, EVERYWHERE = -0.1, -2.0
 WHOLE = {"simulation.connection_radius": 0.06, "simulation.max_neighbors": 80}
-"""Springs of a shell that reach its other side; shorter ones bend like a sheet, and it collapses."""
+"""Springs of a shell that reach its other side; it collapses with shorter ones."""
 
 
 @pytest.mark.parametrize(
