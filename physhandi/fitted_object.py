@@ -101,7 +101,7 @@ class FittedObject:
         self.contacts = contacts
         self._keeps_springs = keeps_springs
         self.placement: PlacedObject | None = None
-        """What was found out to lay the object into a recording that it was not fitted in."""
+        """Placement of the object in a recording that it was not fitted in."""
         self._unedited = fitted.model if fitted.unedited is None else fitted.unedited
         everything = np.ascontiguousarray(fitted.control, dtype=np.float32)
         self._all_controls = np.ascontiguousarray(everything[:, : self._unedited.control_count])

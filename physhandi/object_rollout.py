@@ -47,7 +47,7 @@ class ObjectRollout:
     model: SpringMassModel
     """Topology and material; see `model_in` for the frames after a restart."""
     parameters: SimulationParameters
-    """What the object was simulated with."""
+    """Simulation parameters of the object."""
     control: Float[ndarray, "frame control 3"]
     """Control node positions [m]."""
     position: Float[ndarray, "frame node 3"]
@@ -63,9 +63,9 @@ class ObjectRollout:
     restart: Restart | None = None
     """State from which the frames after `restart.frame` start, in place of the rollout's own."""
     hand_shift: Float[ndarray, "control 3"] | None = None
-    """What a restart that moves hands adds to control nodes [m]; found out when it is needed."""
+    """Shift that a restart gives to the control nodes [m]; computed when it is needed."""
     edits: Edits = ()
-    """What was done to single springs and nodes of the model."""
+    """Edits of single springs and nodes of the model."""
     unedited: SpringMassModel | None = None
     """The model without its edits; None if it has none."""
     scene: Callable[[], SceneData] | None = None

@@ -1,4 +1,4 @@
-"""What splats give every pixel, and how that changes with the splats.
+"""Kernels that draw splats, and their derivatives with respect to the splats.
 
 A picture is cut into square tiles. Every tile has a list of the splats that reach into it, the
 nearest first, and its pixels go through that list alone. Nothing is added with atomics: on the way

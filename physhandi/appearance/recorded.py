@@ -1,4 +1,4 @@
-"""What a view recorded of an object in a frame, as pictures of splats are compared with it."""
+"""Recorded pictures of an object in a frame, with which pictures of splats are compared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -86,7 +86,7 @@ class SequenceWriter:
 
     @property
     def checkpoints(self) -> list[Any]:
-        """What `checkpoint` was told before this writer went on; their files are all there."""
+        """States that `checkpoint` stored before this writer resumed; their files are all there."""
         return list(self._checkpoints)
 
     def checkpoint(self, state: Any) -> None:

@@ -1,4 +1,4 @@
-"""What really happened in a recording, for scoring only: the optional folder ``truth/``.
+"""Ground truth of a recording, for scoring only: the optional folder ``truth/``.
 
 No stage of a fit reads it. Simulated recordings can have it, and recordings of a better sensor.
 Views that are held out lie in it too, with a ``camera.yaml`` each, so that what copies a recording

@@ -37,7 +37,7 @@ _FARTHEST_GRIP = 8.0
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectSize:
-    """What the scale of an object's parameters follows from; lengths in the recording's unit."""
+    """Size of an object, from which its parameters are scaled; lengths in the recording's unit."""
 
     spacing: float
     """Mean distance of the nodes from their two nearest neighbors, at rest."""

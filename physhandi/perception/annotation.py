@@ -48,9 +48,9 @@ BUILT_IN = "built-in"
 LENGTHS_ALONG = "lengths along it from its ends"
 """Method of tracks of a thin object in the provenance."""
 _HASH = "model_sha256"
-"""What it says of those that a model of the user made here."""
+"""Provenance field of masks and tracks that a model of the user made here."""
 _UNFINISHED = "unfinished"
-"""What it says of those that are being stored."""
+"""Provenance field of masks that are being stored."""
 _TRACK_FILES = ("track.npy", "track_visible.npy")
 _FILES = ("mask", *_TRACK_FILES)
 

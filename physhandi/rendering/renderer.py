@@ -25,7 +25,7 @@ from physhandi.rendering.projection import Projection, project
 from physhandi.rendering.shapes import Shape
 
 NEAR = 1e-3
-"""What is nearer to the camera is not seen, unless a caller says otherwise."""
+"""Distance from the camera below which nothing is drawn, unless a caller says otherwise."""
 FROM_ABOVE = np.array([0.0, 0.0, 1.0])
 """Light straight from above."""
 _STRIP = 2**19

@@ -1,4 +1,4 @@
-"""What can be drawn: surfaces, balls, line segments, images and, made of these, arrows.
+"""Shapes that can be drawn: surfaces, balls, line segments, images and, made of these, arrows.
 
 Places are in the world and in its unit of length. Colors are red, green and blue from 0 to 255.
 """

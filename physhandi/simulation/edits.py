@@ -27,7 +27,7 @@ MOST_EDITS = 1000
 PIN_SHARE = 0.1
 """Least rest length of a spring that holds a node, as a part of the median of object springs."""
 BARE_LENGTH = 0.01
-"""What counts as that median of an object without springs [m]."""
+"""Value in the place of that median for an object without springs [m]."""
 
 _Number = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 """Number of a node."""

@@ -1,1 +1,1 @@
-"""What recordings are asked for before a fit, and what there is to doubt about it afterwards."""
+"""Checks of recordings before a fit, and warnings about its result afterwards."""

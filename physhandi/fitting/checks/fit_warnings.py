@@ -1,4 +1,4 @@
-"""What a fit knows of its own weaknesses: warnings for people, with a code for programs.
+"""Warnings about the result of a fit: text for people, with a code for programs.
 
 `fit_warnings` looks at what a run has stored of a sequence and at its measures. The measures of
 predicted frames compare with what the recording shows there, so these warnings are results as well:

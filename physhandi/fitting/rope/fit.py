@@ -220,7 +220,7 @@ class RopeFit:
         self._simulators: dict[str, Simulator] = {}
         self._seen = {problem.name: seen_nodes(problem) for problem in problems}
         self.balanced = balanced
-        """What the balance of moments found; None if nothing."""
+        """Rope that the balance of moments yields; None if it has no solution."""
 
     def likely(self) -> tuple[Bending, float]:
         """Give the rope that the balance of moments found, or the straight one, and its loss."""
