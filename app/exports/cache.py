@@ -126,8 +126,8 @@ class FileCache:
         """Have a file made that nobody else will ask for.
 
         Args:
-            order: What is to be made; its `take` is replaced.
-            prepare: Puts a rollout into a folder, see `store_take`.
+            order: What is to be made; its `rollout` is replaced.
+            prepare: Puts a rollout into a folder, see `store_rollout`.
 
         Yields:
             The file, which is gone afterwards.
@@ -136,7 +136,7 @@ class FileCache:
         folder.mkdir(parents=True)
         try:
             prepare(folder)
-            whole = replace(order, take=str(folder))
+            whole = replace(order, rollout=str(folder))
             whole.check()
             out = folder / f"file.{order.suffix}"
             with self._lock:

@@ -55,8 +55,8 @@ class FileRequest:
     """Only this frame, as one file (PLY); None for all, or for splats where they were fitted."""
     recordings: Mapping[str, str] = field(default_factory=dict[str, str])
     """Folders of recordings by name, for runs whose recording has moved."""
-    take: str = ""
-    """Folder with a rollout that was simulated elsewhere; see `store_take`."""
+    rollout: str = ""
+    """Folder with a rollout that was simulated elsewhere; see `store_rollout`."""
     width: int = 1280
     """Width of a picture or film [px]."""
     height: int = 720

@@ -170,7 +170,7 @@ def snapshot_csv(snapshot: Snapshot) -> bytes:
     """
     if snapshot.compared is not None:
         sides = snapshot.compared.items()
-        rows = (row for name, (take, frame) in sides for row in _side_rows(name, take, frame))
+        rows = (row for name, (rollout, frame) in sides for row in _side_rows(name, rollout, frame))
         return csv_bytes(_COMPARISON_COLUMNS, rows)
     rollout = _rollout(snapshot)
     return csv_bytes(_MEAN_COLUMNS, (_mean_row(rollout, frame) for frame in range(rollout.ready)))

@@ -31,7 +31,7 @@ from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.edits import Edits, encode_edits, keeps_what_is_joined
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.steering import Take
+from physhandi.simulation.steering import SteeredMotion
 
 logger = logging.getLogger(__name__)
 
@@ -170,7 +170,7 @@ class SimulationClient:
     def steer(
         self,
         session: str,
-        take: Take,
+        motion: SteeredMotion,
         limits: HandLimits,
         *,
         replays: bool = False,
@@ -183,9 +183,9 @@ class SimulationClient:
 
         Args:
             session: A session with a listener; what it asked for before is dropped.
-            take: The state to begin in, and the hands; poses after the first are not used.
+            motion: The state to begin in, and the hands; poses after the first are not used.
             limits: What no hand that is steered can do.
-            replays: Whether to simulate the poses of the take instead, and then to end.
+            replays: Whether to simulate the poses of the motion instead, and then to end.
             is_paced: Whether to wait until a frame is due, as far as it is not late.
 
         Returns:
@@ -193,14 +193,14 @@ class SimulationClient:
         """
         fields = {
             "session": session,
-            "parameters": take.parameters.to_dict(),
+            "parameters": motion.parameters.to_dict(),
             "replays": replays,
-            "period": 1.0 / take.parameters.frame_rate if is_paced else 0.0,
+            "period": 1.0 / motion.parameters.frame_rate if is_paced else 0.0,
             "limits": asdict(limits),
         }
         with self._lock:
             number = next(self._numbers)
-            message = Message(STEER, fields | {"request": number}, take.to_tensors())
+            message = Message(STEER, fields | {"request": number}, motion.to_tensors())
             self._unfinished.pop(session, None)
             if self._connection is None:
                 self._unfinished[session] = _Unfinished(message)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.simulation.fingers import Fingers
-from physhandi.simulation.steering import Take, turn_between, turn_on
+from physhandi.simulation.steering import SteeredMotion, turn_between, turn_on
 
 LAG = 0.1
 """Time in which a hand takes up most of a change of its speed [s]."""
@@ -193,8 +193,8 @@ class HandDrive:
 class Drives:
     """The hands of one steered object."""
 
-    def __init__(self, take: Take, limits: HandLimits) -> None:
-        """Begin at rest in the first frame of a take; see `HandDrive`.
+    def __init__(self, motion: SteeredMotion, limits: HandLimits) -> None:
+        """Begin at rest in the first frame of a motion; see `HandDrive`.
 
         No control node goes lower than the ground, or than where the lowest one of its hand was
         recorded if that is lower: what is pressed through a table is thrown about.
@@ -202,12 +202,12 @@ class Drives:
         self._drives = [
             HandDrive(
                 pose,
-                frame_rate=take.parameters.frame_rate,
+                frame_rate=motion.parameters.frame_rate,
                 limits=limits,
-                depth=partial(take.depth_below_ground, number),
-                fingers=take.hands[number].fingers,
+                depth=partial(motion.depth_below_ground, number),
+                fingers=motion.hands[number].fingers,
             )
-            for number, pose in enumerate(take.pose[0])
+            for number, pose in enumerate(motion.pose[0])
         ]
 
     def obey(self, orders: Sequence[Mapping[str, Any]], most_force: float | None) -> None:

@@ -26,7 +26,7 @@ from physhandi.simulation.edits import Edits, decode_edits
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps
-from physhandi.simulation.steering import SteeredSimulation, Take
+from physhandi.simulation.steering import SteeredMotion, SteeredSimulation
 from physhandi.simulation.topology import build_model
 
 logger = logging.getLogger(__name__)
@@ -292,13 +292,13 @@ class SimulationWorker:
         send(self._connection, Message("finished", about))
 
     def _steer(self, request: Message, about: dict[str, object]) -> Iterator[int]:
-        """Simulate the frames of a take, or without end what is steered from its first frame on."""
-        take = Take.from_tensors(
+        """Simulate the frames of a motion, or without end what is steered from its start on."""
+        motion = SteeredMotion.from_tensors(
             request.arrays, SimulationParameters.from_dict(request["parameters"])
         )
-        drives = Drives(take, HandLimits(**request["limits"]))
-        steered = SteeredSimulation(take, self._device)
-        state, pose, duration = steered.state, take.pose[0], 0.0
+        drives = Drives(motion, HandLimits(**request["limits"]))
+        steered = SteeredSimulation(motion, self._device)
+        state, pose, duration = steered.state, motion.pose[0], 0.0
         pull = steered.pulls(state)
         while True:
             frame = steered.frame
@@ -311,8 +311,8 @@ class SimulationWorker:
                 if told is not None:
                     drives.obey(told["orders"], told["most_force"])
                 pose = drives.next(pull)
-            elif frame + 1 < take.frame_count:
-                pose = take.pose[frame + 1]
+            elif frame + 1 < motion.frame_count:
+                pose = motion.pose[frame + 1]
             else:
                 break
             clock = time.perf_counter()

@@ -286,12 +286,12 @@ def test_a_new_frame_is_one_that_only_the_new_rollout_has() -> None:
 def test_the_heavy_scene_pulls_at_three_hundred_nodes(tmp_path: Path) -> None:
     run = make_heavy_run(tmp_path)
     run.verify()
-    take = load_fitted(run, HEAVY)
-    assert take is not None
-    assert take.model.node_count == HEAVY_NODES == 3000
-    assert take.model.object_spring_count > 5000
+    rollout = load_fitted(run, HEAVY)
+    assert rollout is not None
+    assert rollout.model.node_count == HEAVY_NODES == 3000
+    assert rollout.model.object_spring_count > 5000
     for frame in (1, 30, 58):
-        force = np.linalg.norm(take.forces(frame), axis=-1)
+        force = np.linalg.norm(rollout.forces(frame), axis=-1)
         assert np.count_nonzero(force > QUIET_FORCE) == HEAVY_ARROWS == 300
 
 

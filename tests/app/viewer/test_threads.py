@@ -132,11 +132,11 @@ def test_the_errors_are_those_of_the_rollout_that_was_read_last(
         followed: list[object] = []
         has_begun, is_past = threading.Event(), threading.Event()
 
-        def follow(take: object, *, at_once: bool) -> None:
-            if take is old:
+        def follow(rollout: object, *, at_once: bool) -> None:
+            if rollout is old:
                 has_begun.set()
                 is_past.wait(SHORT)
-            followed.append(take)
+            followed.append(rollout)
 
         monkeypatch.setattr(simulated._errors, "follow", follow)
         monkeypatch.setattr(simulated, "_show_readout", lambda **_: simulated._rollouts.readout)
