@@ -148,8 +148,8 @@ def create_health(
         free = machine.load()["disk"]["free"]
         if free < LEAST_DISK:
             reasons.append(f"The disk has {free / 2**20:.0f} MiB left; free some space.")
-        told = {"status": "not ready" if reasons else "ready", "reasons": reasons}
-        return JSONResponse(told, status_code=503 if reasons else 200)
+        state = {"status": "not ready" if reasons else "ready", "reasons": reasons}
+        return JSONResponse(state, status_code=503 if reasons else 200)
 
     @router.get("/metrics")
     def metrics(request: Request) -> Response:

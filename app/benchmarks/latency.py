@@ -215,8 +215,8 @@ def measure_latency(
 
 def _steered(moments: Sequence[float], durations: Sequence[float]) -> dict[str, float]:
     """Say how fast frames came while hands were steered, the first ones left out."""
-    kept = slice(_STEERED // 4, None)
-    came, took = moments[kept], durations[kept]
+    counted = slice(_STEERED // 4, None)
+    came, took = moments[counted], durations[counted]
     return {
         "ms_per_frame": 1e3 * median(took),
         "p95_ms_per_frame": 1e3 * float(np.quantile(took, 0.95)),

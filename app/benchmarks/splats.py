@@ -87,12 +87,12 @@ def measure_splats(
     for count in counts:
         splats = scattered(content.surface, content.fitted.position[0], count)
         kinds[f"splats_{count}"] = "splats", splats
-    found = {
+    measured = {
         name: _measure(replace(content, splats=splats), content.fitted, form, browser, seconds)
         for name, (form, splats) in kinds.items()
     }
-    held = found.get(BUDGETED, found[f"splats_{max(counts)}"])
-    return {"frame_bytes": held["frame_bytes"], "server_ms": held["server_ms"], "kinds": found}
+    held = measured.get(BUDGETED, measured[f"splats_{max(counts)}"])
+    return {"frame_bytes": held["frame_bytes"], "server_ms": held["server_ms"], "kinds": measured}
 
 
 def scattered(surface: ObjectSurface, node: np.ndarray, count: int) -> Splats:

@@ -166,9 +166,11 @@ def _rounded(
     content = replace(content, hands=hands, control=control, surface=surface)
     if rollout is None:
         return content, None
-    known = {field.name: getattr(rollout, field.name) for field in fields(rollout) if field.init}
-    known |= {
+    arguments = {
+        field.name: getattr(rollout, field.name) for field in fields(rollout) if field.init
+    }
+    arguments |= {
         "position": _on_grid(rollout.position, step),
         "control": _on_grid(rollout.control, step),
     }
-    return content, _RoundedRollout(**known, exact=rollout)
+    return content, _RoundedRollout(**arguments, exact=rollout)

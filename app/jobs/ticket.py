@@ -87,7 +87,7 @@ def read_ticket(path: Path) -> Ticket | None:
         why=_field_of(content, "why", Text, ""),
         device=_field_of(content, "device", Text, ""),
         engine=_field_of(content, "engine", Text, ""),
-        priority=next((known for known in get_args(Priority) if known == priority), "normal"),
+        priority=next((level for level in get_args(Priority) if level == priority), "normal"),
         who=_field_of(content, "who", Text, ""),
     )
 
@@ -198,12 +198,12 @@ def note_end(run_folder: Path, error: str, kind: str = "") -> None:
             return
         (run_folder / RESERVE).unlink(missing_ok=True)
         if not (run_folder / EXIT).is_file():
-            told: dict[str, str] = {"state": "failed", "error": error, "error_type": kind}
+            end: dict[str, str] = {"state": "failed", "error": error, "error_type": kind}
             if is_filled(run_folder):
-                told = {"state": "succeeded"}
+                end = {"state": "succeeded"}
             elif is_cancelled:
-                told = {"state": "cancelled", "error": "Cancelled.", "error_type": ""}
-            write_json(run_folder / EXIT, {**told, "time": now()})
+                end = {"state": "cancelled", "error": "Cancelled.", "error_type": ""}
+            write_json(run_folder / EXIT, {**end, "time": now()})
         (run_folder / STARTED).unlink(missing_ok=True)
 
 

@@ -61,8 +61,8 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
         "name": sequence.name,
         "description": sequence.description,
         "label": sequence.label,
-        "origin": _told(sequence.provenance, "origin"),
-        "licence": _told(sequence.provenance, "licence", "license"),
+        "origin": _first_text(sequence.provenance, "origin"),
+        "licence": _first_text(sequence.provenance, "licence", "license"),
         "frame_count": sequence.frame_count,
         "frame_rate": sequence.frame_rate,
         "duration_s": sequence.frame_count / sequence.frame_rate,
@@ -76,10 +76,10 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
     }
 
 
-def _told(provenance: Mapping[str, Any], *names: str) -> str:
+def _first_text(provenance: Mapping[str, Any], *names: str) -> str:
     """Give the first of these fields that is text, which whoever made the sequence wrote."""
-    found = (provenance.get(name) for name in names)
-    return next((text for text in found if isinstance(text, str)), "")
+    values = (provenance.get(name) for name in names)
+    return next((text for text in values if isinstance(text, str)), "")
 
 
 def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
@@ -560,9 +560,9 @@ def thin(curve: list[list[float]], limit: int) -> list[list[float]]:
 
 def _points(curve: object) -> list[list[float]]:
     """Keep the points of a stored curve that have a finite loss."""
-    found: list[list[float]] = []
+    points: list[list[float]] = []
     for point in cast("list[Any]", curve) if isinstance(curve, list) else []:
         values = cast("list[Any]", point)[:2] if isinstance(point, list) else []
         if len(values) == 2 and all(isinstance(value, int | float) for value in values):
-            found.append(values)
-    return found
+            points.append(values)
+    return points

@@ -48,8 +48,8 @@ class Motion:
     @property
     def tracks(self) -> list[Float[ndarray, "frame point 3"]]:
         """Everything that moves, as points."""
-        found = [vertex for vertex, _ in self.hands]
-        return found + [t for t in (self.node, self.marker, self.control) if t is not None]
+        hand_vertices = [vertex for vertex, _ in self.hands]
+        return hand_vertices + [t for t in (self.node, self.marker, self.control) if t is not None]
 
     @property
     def frame_count(self) -> int:

@@ -71,7 +71,7 @@ class Engine(Protocol):
         """Tell whether a run's supervisor lives; what cannot be found out counts as alive."""
         ...
 
-    def told(self, run_folder: Path) -> str:
+    def waits_for(self, run_folder: Path) -> str:
         """Tell of a run whose supervisor lives, but not its worker, what it waits for."""
         ...
 

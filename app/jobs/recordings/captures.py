@@ -64,12 +64,12 @@ class CaptureFolders:
         folder = self.find(place)
         if not folder.is_dir():
             return []
-        found: list[CaptureEntry] = []
+        entries: list[CaptureEntry] = []
         for path in sorted(folder.iterdir(), key=natural_key):
             is_bag = path.is_file() and path.suffix.lower() in BAG_SUFFIXES
             if (is_bag or path.is_dir()) and self._look(f"{place}/{path.name}") is not None:
-                found.append(CaptureEntry(path.name, f"{place}/{path.name}", is_bag))
-        return found[:_MOST_LISTED]
+                entries.append(CaptureEntry(path.name, f"{place}/{path.name}", is_bag))
+        return entries[:_MOST_LISTED]
 
     def find(self, place: str) -> Path:
         """Find a folder or file.

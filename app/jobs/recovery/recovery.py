@@ -33,8 +33,8 @@ class DamagedFolder:
 def damaged_folders(catalog: Catalog, scheduler: Scheduler) -> list[DamagedFolder]:
     """List the runs and sequences of the data folder that cannot be read."""
     runs = ((item, scheduler.view(item)) for item in catalog.runs() if not item.is_bundled)
-    found = [DamagedFolder("runs", i.id, v.reason) for i, v in runs if v.state == "damaged"]
-    return found + [
+    damaged_runs = [DamagedFolder("runs", i.id, v.reason) for i, v in runs if v.state == "damaged"]
+    return damaged_runs + [
         DamagedFolder("sequences", item.id, item.error)
         for item in catalog.sequences()
         if item.error is not None and not item.is_bundled

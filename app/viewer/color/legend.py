@@ -108,12 +108,12 @@ class Legend:
             shown: Known values of all that is shown.
             item: What has the values: ``node`` or ``vertex``.
         """
-        known = value[np.isfinite(value)]
+        finite = value[np.isfinite(value)]
         return cls(
             scale=scale,
-            unknown=len(value) - len(known),
-            is_known=bool(len(known)),
-            highest=float(known.max(initial=0.0)),
+            unknown=len(value) - len(finite),
+            is_known=bool(len(finite)),
+            highest=float(finite.max(initial=0.0)),
             item=item,
             shown=shown,
         )
@@ -132,8 +132,8 @@ class Legend:
     def frame_limits(self) -> Limits | None:
         """Range that nearly all values of this frame lie in; None if there are none."""
         quantity = self.scale.quantity
-        found = nearly_all(self.shown, quantity)
-        return None if found is None else with_width(found, quantity)
+        limits = nearly_all(self.shown, quantity)
+        return None if limits is None else with_width(limits, quantity)
 
 
 def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Limits | None:

@@ -144,8 +144,8 @@ def chosen_sequences(first: Run, second: Run, wanted: str | None) -> tuple[str, 
     """
     shared = [name for name in first.sequence_names if name in second.sequence_names]
     if wanted is not None and wanted not in shared:
-        told = ", ".join(shared) or "none"
-        raise UsageError(f"sequence: '{wanted[:80]}' is not in both runs. In both: {told}.")
+        names = ", ".join(shared) or "none"
+        raise UsageError(f"sequence: '{wanted[:80]}' is not in both runs. In both: {names}.")
     if wanted is not None or shared:
         name = wanted or next((n for n in shared if _has(first, n) and _has(second, n)), shared[0])
         return name, name

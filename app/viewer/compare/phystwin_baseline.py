@@ -96,10 +96,10 @@ def _candidates(
             vertex = control[offset : offset + hand.vertex.shape[1]]
             seen.append(visible_vertices(content.views, vertex, hand.face) + offset)
         offset += hand.vertex.shape[1]
-    found = np.concatenate(seen)
-    if len(found) == 0:
+    visible = np.concatenate(seen)
+    if len(visible) == 0:
         return everything, "hand vertices", "No camera sees a hand vertex at frame 0."
-    return found, "visible hand points", ""
+    return visible, "visible hand points", ""
 
 
 def _hands_in_order(

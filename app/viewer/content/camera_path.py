@@ -183,9 +183,9 @@ def parse_camera_path(text: str) -> CameraMotion:
     if content is None or content.get("format") != PATH_FORMAT:
         raise UsageError(f'format: a camera path begins with {{"format": "{PATH_FORMAT}", …}}.')
     kind = content.get("kind")
-    known = {"format", "kind", "turn" if kind == "turntable" else "keys"}
+    fields = {"format", "kind", "turn" if kind == "turntable" else "keys"}
     for name in content:
-        if kind in {"keys", "turntable"} and name not in known:
+        if kind in {"keys", "turntable"} and name not in fields:
             raise UsageError(f"{name[:40]}: a camera path of kind '{kind}' has no such field.")
     if kind == "turntable":
         return Turntable(_number(content.get("turn"), "turn", -3600.0, 3600.0))

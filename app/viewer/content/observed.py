@@ -68,7 +68,7 @@ class CloudSet:
         self._end = end
         self._views = [view for view in views if view.has_color and view.has_mask]
         self._frame = 0
-        self._known: dict[int, UInt8[ndarray, "*point 3"]] = {}
+        self._colors: dict[int, UInt8[ndarray, "*point 3"]] = {}
 
     def points(self, frame: int) -> Float[ndarray, "point 3"]:
         """Find the cloud of a frame, thinned out [m]."""
@@ -84,11 +84,11 @@ class CloudSet:
         frame = self._frame
         if not self._views or frame >= self._views[0].frame_count:
             return _GREEN
-        if frame not in self._known:
-            if len(self._known) >= _MOST_FRAMES:
-                self._known.clear()
-            self._known[frame] = self._seen(frame)
-        return self._known[frame]
+        if frame not in self._colors:
+            if len(self._colors) >= _MOST_FRAMES:
+                self._colors.clear()
+            self._colors[frame] = self._seen(frame)
+        return self._colors[frame]
 
     @property
     def is_colored(self) -> bool:

@@ -268,9 +268,9 @@ class EditPanel:
             if is_hidden:
                 self._nodes.hide()
                 return
-            kept = self._selection.within(rollout.model)
-            if kept != self._selection:
-                self._selection = kept
+            present = self._selection.within(rollout.model)
+            if present != self._selection:
+                self._selection = present
                 self._write()
             self._draw(rollout, frame)
 
@@ -321,8 +321,8 @@ class EditPanel:
                 return
             rollout, frame = self._shown()
             cover = self._cover(rollout, frame) if self._only_seen.value else None
-            found = select(eye, shape, rollout, frame, self._kind.value, cover=cover)
-            self._selection = self._selection.changed(found, way)
+            selected = select(eye, shape, rollout, frame, self._kind.value, cover=cover)
+            self._selection = self._selection.changed(selected, way)
         self._show_selection()
 
     def _cover(self, rollout: ObjectRollout, frame: int) -> Cover | None:

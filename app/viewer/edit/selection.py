@@ -164,8 +164,8 @@ class Selection:
             (len(self.springs), "spring"),
             (len(self.virtual), "virtual spring"),
         )
-        told = [f"{count} {name}{'' if count == 1 else 's'}" for count, name in counts if count]
-        return ", ".join(told) or "nothing"
+        parts = [f"{count} {name}{'' if count == 1 else 's'}" for count, name in counts if count]
+        return ", ".join(parts) or "nothing"
 
 
 def of_springs(model: SpringMassModel, chosen: Int[ndarray, " spring"]) -> Selection:
@@ -331,22 +331,22 @@ class DrawnShape(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 class Highlights:
     """Which points and springs of a model are selected; found out once for a selection."""
 
-    _known: tuple[SpringMassModel, Selection, ndarray, ndarray] | None = field(default=None)
+    _cached: tuple[SpringMassModel, Selection, ndarray, ndarray] | None = field(default=None)
 
     def of(
         self, model: SpringMassModel, selection: Selection
     ) -> tuple[Int[ndarray, " node"], Int[ndarray, " spring"]]:
         """Give the selected nodes, and the places of the selected springs in the model's list."""
-        known = self._known
-        if known is None or known[0] is not model or known[1] is not selection:
+        cached = self._cached
+        if cached is None or cached[0] is not model or cached[1] is not selection:
             nodes = np.array(sorted(selection.nodes), np.int64)
             count = model.node_count + model.control_count
             named = [a * count + b for a, b in selection.springs]
             named += [a * count + b + model.node_count for a, b in selection.virtual]
             ends = np.sort(model.spring_nodes.astype(np.int64), axis=1)
             springs = np.flatnonzero(np.isin(ends[:, 0] * count + ends[:, 1], named))
-            known = self._known = (model, selection, nodes, springs)
-        return known[2], known[3]
+            cached = self._cached = (model, selection, nodes, springs)
+        return cached[2], cached[3]
 
 
 def _changed(was: frozenset[_Item], new: frozenset[_Item], way: SelectWay) -> frozenset[_Item]:

@@ -93,15 +93,15 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
     hand, hand_depth = _pick_hand(ray, content, frame) if layers.hands else (None, np.inf)
     if prefers_hand and hand is not None:
         return hand
-    found = None
+    picked = None
     if target.rollout is not None:
-        found = _pick_object(ray, target, target.rollout)
-        if found is None and (layers.surface or layers.splats):
-            found = _pick_surface(ray, target, target.rollout, within=hand_depth)
+        picked = _pick_object(ray, target, target.rollout)
+        if picked is None and (layers.surface or layers.splats):
+            picked = _pick_surface(ray, target, target.rollout, within=hand_depth)
     elif content.control is not None and layers.controls:
         at = _nearest(ray, np.asarray(content.control[frame]), target.spacing)
-        found = None if at is None else Pick(kind="control", index=at[0])
-    return found or _pick_marker(ray, target) or hand
+        picked = None if at is None else Pick(kind="control", index=at[0])
+    return picked or _pick_marker(ray, target) or hand
 
 
 def pick_dot(ray: Ray, dot: Float[ndarray, "dot 3"]) -> int | None:

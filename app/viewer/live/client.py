@@ -217,8 +217,8 @@ class SimulationClient:
             orders: One a hand.
             most_force: A hand that the object pulls at harder gives way [N]; None for no limit.
         """
-        told = [order.to_dict() for order in orders]
-        fields = {"session": session, "orders": told, "most_force": most_force}
+        described = [order.to_dict() for order in orders]
+        fields = {"session": session, "orders": described, "most_force": most_force}
         with self._lock:
             self._write(Message(DRIVE, fields))
 

@@ -307,9 +307,9 @@ class SimulationWorker:
             send(self._connection, Message("frame", fields, arrays))
             yield frame + 1
             if not request["replays"]:
-                told = self._orders.pop(request["session"], None)
-                if told is not None:
-                    drives.obey(told["orders"], told["most_force"])
+                newest = self._orders.pop(request["session"], None)
+                if newest is not None:
+                    drives.obey(newest["orders"], newest["most_force"])
                 pose = drives.next(pull)
             elif frame + 1 < motion.frame_count:
                 pose = motion.pose[frame + 1]

@@ -424,7 +424,7 @@ class KeepPanel:
         self._storage.tell("keep a preset")
         self._choice.want(preset.label)
         self.show()
-        kept = preset.name
+        text = preset.name
         if history.setting.edits:
-            kept += ": the parameters. Edits are kept in the tab Edit, or with a run."
-        notify(event.client, "Preset saved", kept, color="blue")
+            text += ": the parameters. Edits are kept in the tab Edit, or with a run."
+        notify(event.client, "Preset saved", text, color="blue")

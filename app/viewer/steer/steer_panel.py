@@ -647,11 +647,11 @@ class SteerPanel:
         place: Float[ndarray, " 3"],
     ) -> None:
         (number,) = self._moved.hands
-        told, pose = steered.order_of(number), newest.pose[number].copy()
-        if told.bend is not None:
-            pose[7:] = told.bend
+        order, pose = steered.order_of(number), newest.pose[number].copy()
+        if order.bend is not None:
+            pose[7:] = order.bend
         bend = newest.motion.hands[number].follow(finger, place, pose)
-        steered.order(number, replace(told, bend=tuple(float(angle) for angle in bend)))
+        steered.order(number, replace(order, bend=tuple(float(angle) for angle in bend)))
 
     def _keep_apart(self, frame: SteeredFrame) -> None:
         """Remember how two hands are turned, and where they are beside their gizmo [m]."""

@@ -182,8 +182,8 @@ class SteeredObject:
         Raises:
             UsageError: If a number is not finite, or the goal is out of reach.
         """
-        told = {"velocity": order.velocity, "goal": order.goal or (), "bend": order.bend or ()}
-        for name, values in told.items():
+        numbers = {"velocity": order.velocity, "goal": order.goal or (), "bend": order.bend or ()}
+        for name, values in numbers.items():
             if not np.all(np.isfinite(values)):
                 raise UsageError(f"The {name} of a hand must be finite numbers, not {values}.")
         reach = self._limits.reach
@@ -300,8 +300,8 @@ class SteeredObject:
                 return False
             state, was_recording = self._undone.pop(), self._is_recording
             places = [frame is state for frame in self._recorded]
-            kept = places.index(True) + 1 if True in places else 0
-            kept_frames = self._recorded[:kept] or [state]
+            count = places.index(True) + 1 if True in places else 0
+            kept_frames = self._recorded[:count] or [state]
             self._orders = [HandOrder() for _ in state.motion.hands]
             self._go_on(state)
             if was_recording:
@@ -366,8 +366,8 @@ class SteeredObject:
                 self._simulate(self._newest)
             else:
                 self._number = 0
-        told = message.fields.get("error", "The live simulation stopped and is started anew.")
-        self._on_change(message.kind, "" if message.kind == "frame" else str(told))
+        reason = message.fields.get("error", "The live simulation stopped and is started anew.")
+        self._on_change(message.kind, "" if message.kind == "frame" else str(reason))
 
     def _keep(self, frame: SteeredFrame) -> None:
         """Record a frame, if frames are recorded and there is room."""
