@@ -206,10 +206,10 @@ def _known_to(run: Run, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Drop settings that there were not yet when a run was made; it goes on as it began."""
     from physhandi.fitting.config import without_newer
 
-    known = dict(settings)
+    shared = dict(settings)
     if "profile" in settings and "profile" in run.config:
-        known["profile"] = without_newer(settings["profile"], run.asked("profile", dict[str, Any]))
-    return known
+        shared["profile"] = without_newer(settings["profile"], run.asked("profile", dict[str, Any]))
+    return shared
 
 
 def _execute(

@@ -406,7 +406,7 @@ def error_of(message: Mapping[str, Any]) -> PhysHandiError:
 
 
 class Channel:
-    """What a child process hears from its parent and tells it."""
+    """Messages between a child process and its parent, as the child sees them."""
 
     def __init__(self) -> None:
         self.arguments = sys.argv[1:]
@@ -490,12 +490,12 @@ def loading_modules() -> Generator[None]:
     It stays until the process ends. Searches were a quarter of the time that torch, Warp and SciPy
     take to load.
     """
-    known, searches = len(sys.modules), gc.isenabled()
+    module_count, searches = len(sys.modules), gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if len(sys.modules) > known:
+        if len(sys.modules) > module_count:
             gc.freeze()
         if searches:
             gc.enable()

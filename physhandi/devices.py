@@ -95,7 +95,7 @@ def card_of(name: str) -> str | None:
 
 
 ONLY_CARD = "cuda:0"
-"""How a process calls the one graphics card that it sees; see `only_card`."""
+"""Name of the one graphics card that a process sees; see `only_card`."""
 
 
 def only_card(card: str | None) -> dict[str, str]:
@@ -119,7 +119,7 @@ def describe_device(name: str) -> str:
 def _native_errors_held() -> Generator[None]:
     """Keep what native code writes to standard error, and pass it on if this fails."""
     try:
-        kept = os.dup(2)
+        original = os.dup(2)
     except OSError:  # Standard error is closed, so nothing would be seen of it anyway.
         yield
         return
@@ -129,10 +129,10 @@ def _native_errors_held() -> Generator[None]:
         try:
             yield
         except BaseException:
-            os.dup2(kept, 2)
+            os.dup2(original, 2)
             held.seek(0)
             os.write(2, held.read())
             raise
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(original, 2)
+            os.close(original)

@@ -57,7 +57,7 @@ _STEP = parameter_names("step")
 
 
 ROLLOUT = "rollout"
-"""What the simulation of an object is called where its progress is told."""
+"""Stage name of an object's simulation in progress reports."""
 
 Frame = tuple[int, Float[ndarray, "node 3"], Float[ndarray, "node 3"]]
 
@@ -173,7 +173,7 @@ class FittedObject:
 
     @property
     def edits(self) -> Edits:
-        """What was done to single springs and nodes of the model, in this order."""
+        """Edits of single springs and nodes of the model, in their order."""
         return self.fitted.edits
 
     def begin(

@@ -117,7 +117,7 @@ def settings_of(profile: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
     return apply_overrides(load_profile(profile), overrides).to_dict()
 
 
-def reconstruct(
+def run_reconstruction(
     sequences: Many[Sequence],
     config: PipelineConfig,
     attempt: Attempt,
@@ -213,7 +213,7 @@ def predict(
     _finish(attempt, EVALUATION, [], [], [])
 
 
-def simulate(
+def run_simulation(
     source: RunFolder,
     sequences: Many[Sequence],
     changes: Mapping[str, Any],
@@ -321,8 +321,8 @@ def _stage_take(
         )
     fitted = FittedObject.of(source, stored.sequence)
     rest_node = artefacts.load_rest_node(source.out)
-    kept = contacts_from(fitted.contacts, stored.frame)
-    contacts = contacts_in(take.model) if take.is_regripped else kept
+    continued = contacts_from(fitted.contacts, stored.frame)
+    contacts = contacts_in(take.model) if take.is_regripped else continued
     attachment = with_points(artefacts.load_attachment(source.out, stored.sequence), take.model)
     artefacts.save_sequence_meta(attempt, sequence)
     artefacts.save_observation(attempt, name, observe_object(sequence, progress))
@@ -491,15 +491,15 @@ def _prepare(
     keeper: Keeper,
 ) -> bool:
     """Reconstruct hands and collect what was seen; tell whether there is an object to fit."""
-    found = readiness(sequences, config)
-    if not found[EVALUATION].is_ready:
+    stages = readiness(sequences, config)
+    if not stages[EVALUATION].is_ready:
         raise MissingInputError(nothing_to_fit(sequences))
     for sequence in sequences:
         artefacts.save_sequence_meta(attempt, sequence)
     _stage_hands(sequences, config, attempt, progress, keeper)
-    if found[OBSERVATION].is_ready:
+    if stages[OBSERVATION].is_ready:
         _stage_observation(sequences, config, attempt, progress)
-    return found[OBSERVATION].is_ready
+    return stages[OBSERVATION].is_ready
 
 
 def _stage_hands(
@@ -536,7 +536,7 @@ def _stage_observation(
     if attempt.stage_done(OBSERVATION):
         return
     template = None
-    found = ""
+    note = ""
     for number, sequence in enumerate(sequences):
         observation = observe_object(sequence, progress)
         node, rest_node, shape = object_nodes_of(sequence, observation, config, template)
@@ -552,9 +552,9 @@ def _stage_observation(
             attempt.save_array(REST_NODE_FILE, rest_node.astype(np.float32))
         if shape is not None:
             attempt.save_yaml(SHAPE_FILE, shape.to_dict())
-            found = str(shape)
-        progress.report(OBSERVATION, number + 1, len(sequences), message=found)
-    _finish(attempt, OBSERVATION, [], [], [], note=found)
+            note = str(shape)
+        progress.report(OBSERVATION, number + 1, len(sequences), message=note)
+    _finish(attempt, OBSERVATION, [], [], [], note=note)
 
 
 def _problems(
@@ -746,9 +746,9 @@ def _stage_appearance(
     """What the object looks like: splats, fitted to frame 0 of the first sequence."""
     if attempt.stage_done(APPEARANCE):
         return
-    found = readiness(sequences, config)[APPEARANCE]
-    if not found.is_ready:
-        _finish(attempt, APPEARANCE, [], [], [], note=f"Left out: {found.why}.")
+    stage = readiness(sequences, config)[APPEARANCE]
+    if not stage.is_ready:
+        _finish(attempt, APPEARANCE, [], [], [], note=f"Left out: {stage.why}.")
         return
     fitted = fit_appearance(
         attempt.out,
@@ -786,8 +786,8 @@ def _stage_evaluation(
                 try:
                     _store_restart(attempt, sequence, device, config.object_)
                 except MissingInputError as error:
-                    told = f"Predicted without a restart. {error}"
-                    progress.report(EVALUATION, number, len(sequences), message=told)
+                    message = f"Predicted without a restart. {error}"
+                    progress.report(EVALUATION, number, len(sequences), message=message)
             fitted = _stored_object(attempt, sequence)
             _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
         metrics[sequence.name] = _measure(sequence, attempt, progress, device=device)
@@ -881,7 +881,7 @@ def run_job(
             source = RunFolder.open(Path(run.asked("source", str)))
             changes = run.asked("parameters", dict[str, Any])
             edits = read_edits(run.folder / EDITS_FILE) if "edits" in run.config else None
-            simulate(
+            run_simulation(
                 source,
                 sequences,
                 changes,
@@ -893,7 +893,7 @@ def run_job(
             )
         else:
             config = PipelineConfig.from_dict(run.asked("profile", dict[str, Any]))
-            reconstruct(
+            run_reconstruction(
                 sequences, config, attempt, watched, device=device, more_devices=more_devices
             )
         attempt.publish(store)

@@ -1,4 +1,4 @@
-"""How long work tells what it is doing, and learns that it should stop."""
+"""Progress of long work, and requests to stop it."""
 
 import sys
 import time
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Preview:
-    """What a stage has in hand at the moment, to be looked at while it goes on."""
+    """Intermediate result of a stage that is running."""
 
     stage: str
     """Name of the stage."""
@@ -162,7 +162,7 @@ class PrintedProgress(Progress):
 ReportFunction = Callable[[str, int, int, float | None, str], object]
 """Is given stage, iteration, total, loss and message, as `Progress.report` is."""
 Watcher = Progress | ReportFunction | bool | None
-"""Who is told how far work is: True prints, a function is called, None and False are nobody."""
+"""Receiver of progress: True prints, a function is called, None and False are nobody."""
 
 
 class _CalledProgress(Progress):

@@ -19,14 +19,14 @@ def warnings_in(metrics: Mapping[str, Any]) -> list[dict[str, str]]:
     Returns:
         For each ``sequence code message``.
     """
-    found: list[dict[str, str]] = []
+    collected: list[dict[str, str]] = []
     for name, scores in metrics.items():
         listed = (named_fields(scores) or {}).get("warnings")
         for warning in cast("list[Any]", listed) if isinstance(listed, list) else []:
             fields = named_fields(warning) or {}
             texts = {key: str(fields.get(key, "")) for key in ("code", "message")}
-            found.append({"sequence": name, **texts})
-    return found
+            collected.append({"sequence": name, **texts})
+    return collected
 
 
 class Run(RunFolder):
@@ -43,7 +43,7 @@ class Run(RunFolder):
 
     @property
     def warnings(self) -> list[dict[str, str]]:
-        """What there is to doubt about the fit: ``sequence code message`` each (docs/metrics.md).
+        """Warnings about the fit: ``sequence code message`` each (docs/metrics.md).
 
         Empty if there is nothing, if the run has not been measured yet, or if a version measured it
         that looked for no doubts.

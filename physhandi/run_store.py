@@ -54,11 +54,11 @@ class RunStore:
         if urlsplit(url).password is not None:
             raise UsageError("The address of a store must hold no password: it is seen by others.")
         try:
-            found: tuple[Any, Any] = import_module("fsspec.core").url_to_fs(url)
+            opened: tuple[Any, Any] = import_module("fsspec.core").url_to_fs(url)
         except (ImportError, ValueError) as error:
             raise UsageError(f"The store {url} cannot be used: {describe(error)}") from None
-        self._files = found[0]
-        self._root = str(found[1])
+        self._files = opened[0]
+        self._root = str(opened[1])
         self.url = url.rstrip("/")
         """Its address."""
 

@@ -40,18 +40,18 @@ ValueKind = Literal["number", "whole", "switch", "choice", "text", "settings", "
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """What a class of settings declares about one of its fields."""
+    """Declaration of one field of a class of settings."""
 
     name: str
     """Its name."""
     type: Any
     """Type with bounds, as msgspec checks it."""
     kind: ValueKind
-    """What sort of value it takes; ``settings`` and ``mapping`` hold further fields."""
+    """Kind of its value; ``settings`` and ``mapping`` hold further fields."""
     about: str
-    """What it means, in a sentence."""
+    """Meaning, in a sentence."""
     unit: str
-    """What it is measured in; empty for a mere number."""
+    """Unit; empty for a mere number."""
     low: float | None
     """Lowest value; none if that side is open."""
     high: float | None
@@ -65,7 +65,7 @@ class Field:
     inner: "type[Settings] | None"
     """Class of the settings that it holds, or that each item of its mapping is."""
     notes: tuple[Any, ...]
-    """What else its annotation says."""
+    """Further metadata of its annotation."""
 
     def problem_of(self, value: Any) -> str:
         """Say what a value ought to be if it is wrong; empty if it is right."""
@@ -89,7 +89,7 @@ class Field:
 
     @property
     def wanted(self) -> str:
-        """What values it takes, in words."""
+        """Allowed values, in words."""
         if self.kind in {"settings", "mapping"}:
             return "a mapping of fields"
         if self.kind == "switch":
@@ -143,8 +143,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         Raises:
             SettingsError: If a field is unknown, or a value of the wrong kind or out of bounds.
         """
-        known = [field.name for field in fields_of(type(self))]
-        unknown = {name: no_such("field", name, known) for name in changes if name not in known}
+        names = [field.name for field in fields_of(type(self))]
+        unknown = {name: no_such("field", name, names) for name in changes if name not in names}
         if unknown:
             raise SettingsError(unknown)
         return msgspec.structs.replace(self, **changes)
@@ -213,12 +213,12 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}…"
 
 
-def no_such(what: str, name: str, known: Iterable[str]) -> str:
+def no_such(what: str, name: str, names: Iterable[str]) -> str:
     """Say that there is no field or setting of a name, and which one comes nearest."""
-    near = difflib.get_close_matches(name, known := list(known), n=1, cutoff=0.6)
+    near = difflib.get_close_matches(name, names := list(names), n=1, cutoff=0.6)
     if near:
         return f"There is no {what} '{name[:80]}'. Do you mean '{near[0]}'?"
-    offered = ", ".join(known) if len(known) <= 40 else ""
+    offered = ", ".join(names) if len(names) <= 40 else ""
     return f"There is no {what} '{name[:80]}'." + (f" There are: {offered}." if offered else "")
 
 
@@ -248,7 +248,7 @@ def problems_in(kind: type[Settings], values: Any, path: str = "") -> dict[str, 
     fields = {field.name: field for field in fields_of(kind)}
     at = f"{path}." if path else ""
     problems = {
-        f"{at}{name}": no_such("field", f"{at}{name}", [f"{at}{known}" for known in fields])
+        f"{at}{name}": no_such("field", f"{at}{name}", [f"{at}{other}" for other in fields])
         for name in given
         if name not in fields
     }
@@ -280,8 +280,8 @@ def _problems_between(kind: type[Settings], values: Any, path: str) -> dict[str,
         to_typed(values, kind)
     except SettingsError as error:
         return {
-            f"{at}{name}" if name else path: told if name or not path else f"{path}: {told}"
-            for name, told in error.fields.items()
+            f"{at}{name}" if name else path: message if name or not path else f"{path}: {message}"
+            for name, message in error.fields.items()
         }
     except msgspec.ValidationError as error:
         return {path: f"{path}: {error}"}

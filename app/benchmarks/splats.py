@@ -12,7 +12,7 @@ import viser
 
 from app.benchmarks.browser import new_page
 from app.benchmarks.viewer_client import ViewerClient
-from app.viewer.content.content import Content, open_run
+from app.viewer.content.content import Content, open_run_content
 from app.viewer.content.layers import OBJECT_FORMS, ObjectForm
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import SceneDrawing
@@ -77,7 +77,7 @@ def measure_splats(
     Raises:
         MissingInputError: If the object has no surface.
     """
-    content = open_run(_Places(run), run.id, sequence)
+    content = open_run_content(_Places(run), run.id, sequence)
     if content.fitted is None or content.surface is None:
         raise MissingInputError(f"The object of run '{run.name}' has no surface to lay splats on.")
     kinds: dict[str, tuple[ObjectForm, Splats | None]] = {

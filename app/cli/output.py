@@ -18,7 +18,7 @@ Devices = Annotated[
     str,
     arg(help="Warp device: auto, cpu, cuda or cuda:0; several GPUs: all, or cuda:0,cuda:1."),
 ]
-Engine = Annotated[
+EngineChoice = Annotated[
     str | None,
     arg(
         help="Where it is computed: local, or ray://HOST:PORT, the address of the Jobs API of a "

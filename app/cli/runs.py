@@ -15,7 +15,7 @@ from app.cli.lookup import (
     open_catalog,
     read_settings,
 )
-from app.cli.output import AsJson, DataDir, Device, Devices, Engine, Store, show
+from app.cli.output import AsJson, DataDir, Device, Devices, EngineChoice, Store, show
 from app.jobs.engines.following import FollowedRun, follow_to_end
 from app.jobs.engines.ray_engine import reached_cluster
 from app.jobs.order import default_name, fit_settings
@@ -89,7 +89,7 @@ def reconstruct(
         Annotated[tuple[str, ...], arg(name="set", metavar="PATH=VALUE")]
     ] = (),
     device: Devices = "auto",
-    engine: Engine = None,
+    engine: EngineChoice = None,
     store: Store = None,
     data_dir: DataDir = None,
 ) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from app.cli.lookup import cluster_settings, find_sequence, read_settings
-from app.cli.output import AsJson, DataDir, Devices, Engine, show
+from app.cli.output import AsJson, DataDir, Devices, EngineChoice, show
 from app.jobs.engines.ray_engine import reached_cluster
 from app.settings import LOCAL
 from physhandi.child import loading_modules
@@ -53,7 +53,7 @@ def evaluate_suite(
     out: Path | None = None,
     jobs: Annotated[int | None, arg(help_behavior_hint="(default: one each device)")] = None,
     device: Devices = "auto",
-    engine: Engine = None,
+    engine: EngineChoice = None,
     as_json: AsJson = False,
     data_dir: DataDir = None,
 ) -> None:
@@ -83,7 +83,7 @@ def evaluate_suite(
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
     with loading_modules():
-        from app.cli.suite_jobs import WORKER, SuiteJobs
+        from app.cli.suite_jobs import SUITE_WORKER, SuiteJobs
         from app.cli.suite_processes import SuiteProcesses
         from physhandi.synthetic.suite import evaluation
         from physhandi.synthetic.suite.folder import check_folder
@@ -120,7 +120,7 @@ def evaluate_suite(
     title, cases, place = _table_of(chosen, seeds, named)
     out = out or server.suite_dir / place
     check_folder(out, title, cases)
-    cluster = None if is_here else reached_cluster(cluster_settings(server, device), WORKER)
+    cluster = None if is_here else reached_cluster(cluster_settings(server, device), SUITE_WORKER)
     jobs = _checked_jobs(jobs, len(devices) if cluster is None else cluster.slots, is_here=is_here)
     with watched(True) as progress, ExitStack() as stack:
         # Everything that a user may have got wrong is told before they are started.

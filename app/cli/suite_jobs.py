@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from physhandi.synthetic.suite.evaluation import Fill, Order
     from physhandi.synthetic.suite.suite import Making
 
-WORKER: Final = "app.cli.suite_jobs"
+SUITE_WORKER: Final = "app.cli.suite_jobs"
 _REQUEST, _ENVIRONMENT = "request.json", "environment.json"
 _INTERVAL_S = 0.2
 _TELL_EVERY_S = 0.5
@@ -60,7 +60,7 @@ class SuiteJobs:
         """Prepare.
 
         Args:
-            engine: Its worker is `WORKER`.
+            engine: Its worker is `SUITE_WORKER`.
             out: Folder of the suite, which has the same path on all nodes.
             progress: Told what the jobs do; may ask to stop.
             most: How many jobs there are at a time.

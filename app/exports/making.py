@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.exports.request import FileRequest
-from app.viewer.content.content import Content, open_run, open_sequence
+from app.viewer.content.content import Content, open_run_content, open_sequence_content
 from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import Snapshot, scene_data
@@ -209,8 +209,8 @@ class _Places:
 def _open(order: FileRequest, state: SessionState) -> tuple[Content, Run | None]:
     places = _Places(order)
     if order.kind == "sequence":
-        return open_sequence(places, order.folder), None
-    content = open_run(places, order.folder, state.sequence_name)
+        return open_sequence_content(places, order.folder), None
+    content = open_run_content(places, order.folder, state.sequence_name)
     return content, places.run(order.folder)
 
 

@@ -16,7 +16,7 @@ from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import FRAME_BYTES, SceneDrawing
 from app.viewer.scene.scene_server import start_viser
-from app.viewer.ui.guard import plain
+from app.viewer.ui.guard import without_markup
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.object_surface import ObjectSurface
 
@@ -52,7 +52,7 @@ class Offscreen:
             step = GRID * 2.0 ** float(np.floor(np.log2(framing.extent)))
             self.content, rollout = _rounded(content, rollout, step)
         self._rollout = rollout
-        self.server: viser.ViserServer = start_viser(plain(content.title))
+        self.server: viser.ViserServer = start_viser(without_markup(content.title))
         try:
             self._scene = SceneDrawing(
                 self.server,

@@ -30,7 +30,7 @@ from physhandi.errors import PhysHandiError, describe
 from physhandi.fitting.config import SIMULATION, planned_stages
 from physhandi.run import Run
 
-PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
+RECORDED_PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
 _SHOWN: dict[str, tuple[str, Any]] = {
     "losses": (LOSSES_FILE, PartsFile),
     "metrics": (METRICS_FILE, PartsFile),
@@ -56,7 +56,7 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
     sequence = item.sequence
     if sequence is None:
         return described
-    missing = sequence.missing(*PARTS)
+    missing = sequence.missing(*RECORDED_PARTS)
     return described | {
         "name": sequence.name,
         "description": sequence.description,
@@ -69,7 +69,7 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
         "view_count": len(sequence.views),
         "hands": list(sequence.hands),
         "marker_count": 0 if sequence.marker is None else sequence.marker.shape[1],
-        "parts": [part for part in PARTS if part not in missing],
+        "parts": [part for part in RECORDED_PARTS if part not in missing],
         "metric": sequence.metric,
         "length_unit": sequence.length_unit,
         "reconstruction_frames": len(sequence.reconstruction_frames),

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
+from app.previews.draw import HEIGHT, WIDTH, PreviewMotion, draw_motion
 from app.previews.links import marker_links
 from physhandi.data.files import replacing
 from physhandi.data.layout import SequenceFiles
@@ -123,7 +123,7 @@ def _rate_of(run: Run, name: str) -> float:
     return float(run.recording(name)["frame_rate"]) if is_known else _USUAL_RATE
 
 
-def _found_motion(run: Run, name: str, recording: Path) -> Motion:
+def _found_motion(run: Run, name: str, recording: Path) -> PreviewMotion:
     files = SequenceFiles(name)
     hands: list[tuple[Float[ndarray, "frame vertex 3"], Int[ndarray, "face 3"] | None]] = []
     for side in _SIDES:
@@ -131,10 +131,10 @@ def _found_motion(run: Run, name: str, recording: Path) -> Motion:
         if run.has(stored):
             hands.append((run.array(stored), run.array(face) if run.has(face) else None))
     if not run.has(files.rollout):
-        return Motion(hands=tuple(hands))
+        return PreviewMotion(hands=tuple(hands))
     node = run.array(files.rollout)
     fitted = load_fitted(run, name)
-    return Motion(
+    return PreviewMotion(
         hands=tuple(hands),
         node=node,
         control=run.array(files.control) if not hands and run.has(files.control) else None,
@@ -153,12 +153,14 @@ def _springs(run: Run, rel: str, node_count: int) -> Int[ndarray, "spring 2"]:
     return model["spring_nodes"][inner][shortest[: min(4 * node_count, _LINK_COUNT)]]
 
 
-def _recorded_motion(sequence: Recording) -> Motion:
+def _recorded_motion(sequence: Recording) -> PreviewMotion:
     marker, control = sequence.marker, sequence.control
     if marker is None and control is None and sequence.object_node is not None:
-        return Motion(node=np.repeat(sequence.object_node[None], sequence.frame_count, axis=0))
+        return PreviewMotion(
+            node=np.repeat(sequence.object_node[None], sequence.frame_count, axis=0)
+        )
     links = np.empty((0, 2), dtype=int) if marker is None else marker_links(marker[0])
-    return Motion(marker=marker, control=control, spring=links)
+    return PreviewMotion(marker=marker, control=control, spring=links)
 
 
 def _image(view: View, kind: str, frame: int) -> UInt8[ndarray, "row column 3"]:

@@ -29,7 +29,7 @@ _SAMPLED_POINTS = 4_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Motion:
+class PreviewMotion:
     """What moves in a sequence or a run, in the sequence's own unit of length."""
 
     hands: tuple[tuple[Float[ndarray, "frame vertex 3"], Int[ndarray, "face 3"] | None], ...] = ()
@@ -57,7 +57,7 @@ class Motion:
         return min((len(track) for track in self.tracks), default=0)
 
 
-def draw_motion(motion: Motion, frames: list[int]) -> list[UInt8[ndarray, "row column 4"]]:
+def draw_motion(motion: PreviewMotion, frames: list[int]) -> list[UInt8[ndarray, "row column 4"]]:
     """Draw frames of a motion from a camera that sees all of them.
 
     Args:
@@ -81,7 +81,7 @@ def draw_motion(motion: Motion, frames: list[int]) -> list[UInt8[ndarray, "row c
     return [render(camera, _shapes(camera, motion, frame), light=light) for frame in frames]
 
 
-def _shapes(camera: PinholeCamera, motion: Motion, frame: int) -> list[Shape]:
+def _shapes(camera: PinholeCamera, motion: PreviewMotion, frame: int) -> list[Shape]:
     """List what moves as it is in a frame."""
     shapes: list[Shape] = []
     for vertices, faces in motion.hands:
@@ -112,7 +112,7 @@ def _shapes(camera: PinholeCamera, motion: Motion, frame: int) -> list[Shape]:
     return shapes
 
 
-def _radius(motion: Motion) -> float:
+def _radius(motion: PreviewMotion) -> float:
     """Choose how large points are drawn, the smaller the more there are [px]."""
     tracks = [track for track in (motion.node, motion.marker) if track is not None]
     count = max((track.shape[1] for track in tracks), default=1)

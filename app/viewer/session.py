@@ -17,7 +17,12 @@ from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.color.color_panel import ColorPanel
 from app.viewer.compare.live import LiveComparison
 from app.viewer.content.camera_path import CameraPath
-from app.viewer.content.content import Catalog, Content, open_run, open_sequence
+from app.viewer.content.content import (
+    Content,
+    ContentSource,
+    open_run_content,
+    open_sequence_content,
+)
 from app.viewer.content.layers import default_layers
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.edit.edit_panel import EditPanel
@@ -55,7 +60,7 @@ class Session(SceneServer):
         kind: Kind,
         target: str,
         owner: str,
-        catalog: Catalog,
+        catalog: ContentSource,
         live: SimulationClient,
         state: SessionState | None = None,
         storage: UserStorage | None = None,
@@ -212,8 +217,8 @@ class Session(SceneServer):
 
     def _load(self, sequence_name: str | None) -> Content:
         if self.kind == "run":
-            return open_run(self._catalog, self._target, sequence_name)
-        return open_sequence(self._catalog, self._target)
+            return open_run_content(self._catalog, self._target, sequence_name)
+        return open_sequence_content(self._catalog, self._target)
 
     def _build(self) -> None:
         server, guard = self._server, self._guard

@@ -10,7 +10,7 @@ from typing import get_args
 
 from app.settings import ServerSettings
 from app.viewer.compare.session import CompareSession
-from app.viewer.content.content import Catalog
+from app.viewer.content.content import ContentSource
 from app.viewer.content.session_state import Kind, SessionInfo, SessionState
 from app.viewer.live.client import SimulationClient
 from app.viewer.physics.keep_panel import UserStorage
@@ -56,7 +56,7 @@ class Sessions:
     def __init__(
         self,
         settings: ServerSettings,
-        catalog: Catalog,
+        catalog: ContentSource,
         storage: UserStorage | None = None,
     ) -> None:
         """Prepare; nothing is started before the first session.

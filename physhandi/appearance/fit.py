@@ -64,7 +64,7 @@ _SAMPLES = 4
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedSplats:
-    """What a fit found."""
+    """Result of a fit of splats."""
 
     splats: Splats
     """The splats."""
@@ -408,7 +408,7 @@ class _Fit:
     def splats(self, node: Float[ndarray, "node 3"]) -> Splats:
         """Give the splats that cover something."""
         opacity = self.logit.sigmoid()
-        kept = opacity >= _INVISIBLE
+        is_visible = opacity >= _INVISIBLE
         values: dict[str, Any] = {
             "center": self.center,
             "scale": self.log_scale.exp(),
@@ -416,7 +416,7 @@ class _Fit:
             "opacity": opacity,
         }
         return Splats(
-            **{name: value[kept].cpu().numpy() for name, value in values.items()},
+            **{name: value[is_visible].cpu().numpy() for name, value in values.items()},
             rest_node=np.asarray(node, np.float32),
         )
 

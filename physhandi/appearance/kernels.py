@@ -319,18 +319,18 @@ def ask_splats(
 
 @wp.struct
 class Slopes:
-    """How the loss changes with a splat in the picture."""
+    """Derivatives of the loss with respect to a splat in the picture."""
 
     middle: wp.vec2
-    """With where it is [1/px]."""
+    """With respect to its place [1/px]."""
     conic: wp.vec3
-    """With its inverse covariance [px²]."""
+    """With respect to its inverse covariance [px²]."""
     depth: wp.float32
-    """With its depth [1/m]."""
+    """With respect to its depth [1/m]."""
     color: wp.vec3
-    """With its color."""
+    """With respect to its color."""
     strength: wp.float32
-    """With the logarithm of its opacity."""
+    """With respect to the logarithm of its opacity."""
 
 
 @wp.kernel

@@ -128,14 +128,14 @@ def user_lpips(device: str = "cpu") -> Lpips | None:
 
 def _file(folder: Path, stem: str) -> Path:
     """Find the one file of weights whose name is this but for its ending."""
-    found = sorted(path for path in folder.glob(f"{stem}.*") if path.suffix in _ENDINGS)
-    if len(found) != 1:
-        there = ", ".join(path.name for path in found) or "none"
+    matches = sorted(path for path in folder.glob(f"{stem}.*") if path.suffix in _ENDINGS)
+    if len(matches) != 1:
+        there = ", ".join(path.name for path in matches) or "none"
         raise UsageError(
             f"{LPIPS_VARIABLE}: {folder} must hold one file {stem}.pth (or .pt, .safetensors); "
             f"there: {there}. {_REMEDY}"
         )
-    return found[0]
+    return matches[0]
 
 
 def _tensor(stored: dict[str, Tensor], key: str, shape: tuple[int, ...], path: Path) -> Tensor:

@@ -31,9 +31,9 @@ class Appearance:
     """Splats, and how an object's nodes carry them: what draws any frame of any rollout."""
 
     splats: Splats
-    """What the object looks like."""
+    """Splats of the object."""
     binding: SplatBinding
-    """What carries them."""
+    """Nodes that carry each splat."""
 
     @classmethod
     def of(cls, splats: Splats) -> "Appearance":

@@ -47,17 +47,17 @@ def cut_out_object(views: Sequence[View], frame: int, *, hand_margin: int) -> li
     Raises:
         MissingInputError: If no view with color and masks shows the object.
     """
-    found = [
+    objects = [
         _cut_out(view.straightened(), frame, hand_margin)
         for view in views
         if view.has_color and view.has_mask and (view.mask(frame) == OBJECT_LABEL).any()
     ]
-    if not found:
+    if not objects:
         raise MissingInputError(
             f"No view with color and masks shows the object in frame {frame}, so its appearance "
             "cannot be fitted. Add views/<view>/mask/ and views/<view>/color/."
         )
-    return found
+    return objects
 
 
 def _cut_out(view: View, frame: int, hand_margin: int) -> RecordedObject:

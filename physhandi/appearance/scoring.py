@@ -1,4 +1,4 @@
-"""How well pictures of a rollout agree with what cameras recorded, frame by frame.
+"""Agreement of pictures of a rollout with what cameras recorded, frame by frame.
 
 The object is drawn as its splats, carried by the nodes of the rollout, over black and without
 hands. `physhandi.metrics.photometric` defines the scores.

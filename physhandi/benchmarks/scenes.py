@@ -163,8 +163,8 @@ def radius_for(node: ndarray, spring_count: int) -> float:
         return 0.0
     tree = KDTree(node)
     radius = _SPACING
-    while (found := tree.count_neighbors(tree, radius) - len(node)) < 2 * spring_count:
-        radius *= 1.3 if found else 2.0
+    while (count := tree.count_neighbors(tree, radius) - len(node)) < 2 * spring_count:
+        radius *= 1.3 if count else 2.0
     pair = tree.query_pairs(radius, output_type="ndarray")
     length = np.linalg.norm(node[pair[:, 0]] - node[pair[:, 1]], axis=1)
     return float(np.partition(length, spring_count - 1)[spring_count - 1]) + 1e-9

@@ -47,11 +47,11 @@ def benchmark_splats(
         them, the seconds of a fit and what it reached in a view that it did not see.
     """
     start_warp()
-    found = {
+    results = {
         name: _measure(*SCENES[name], device=device, iterations=iterations)
         for name in scenes or SCENES
     }
-    return {"benchmark": "splats", **describe_machine(device), "scenes": found}
+    return {"benchmark": "splats", **describe_machine(device), "scenes": results}
 
 
 def _measure(
@@ -60,11 +60,11 @@ def _measure(
     cameras = [_camera(part, width, height) for part in range(_PARTS_OF_A_CIRCLE)]
     *seen, unseen = cameras
     splats = _ball(count)
-    kept: dict[str, Any] = {}
+    pictures: dict[str, Any] = {}
 
     def drawing(name: str, draw: Callable[[], ndarray]) -> Callable[[], None]:
         def work() -> None:
-            kept[name] = draw()
+            pictures[name] = draw()
 
         return work
 
@@ -73,7 +73,7 @@ def _measure(
         "baseline": drawing("baseline", lambda: draw_one_by_one(unseen, splats)),
     }
     times = time_in_turns(works, device, _ROUNDS)
-    difference = np.abs(kept["ours"] - kept["baseline"])
+    difference = np.abs(pictures["ours"] - pictures["baseline"])
 
     config = AppearanceConfig(splat_count=count)
     if iterations is not None:

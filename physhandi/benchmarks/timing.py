@@ -41,7 +41,7 @@ def time_in_turns(
             seconds = time.perf_counter() - start
             if is_timed:
                 times[name].append(seconds)
-    return {name: median(found) for name, found in times.items()}
+    return {name: median(durations) for name, durations in times.items()}
 
 
 def copy_bandwidth(device: str) -> float:

@@ -1,1 +1,1 @@
-"""What was recorded, and what a run leaves behind."""
+"""Recordings, and the files of runs."""

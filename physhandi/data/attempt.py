@@ -174,13 +174,13 @@ def encode(preview: Preview, number: int) -> bytes:
         number: How many previews of the attempt there were, this one included.
     """
     picked: dict[str, ndarray] = {}
-    known: dict[str, ndarray] = dict(preview.points)
-    count = len(next(iter(known.values())))
+    by_kind: dict[str, ndarray] = dict(preview.points)
+    count = len(next(iter(by_kind.values())))
     frames = _spread(count, min(count, MOST_FRAMES))
-    for kind, points in known.items():
+    for kind, points in by_kind.items():
         most = min(points.shape[1], MOST_POINTS[kind])
-        kept = _spread(points.shape[1], most)
-        picked[kind] = np.asarray(points[frames][:, kept], np.float32)
+        shown = _spread(points.shape[1], most)
+        picked[kind] = np.asarray(points[frames][:, shown], np.float32)
     # What runs away must not shrink the rest to a dot: the box is that of the first frame, with
     # room for the motion of hands around it.
     low, side = _box(picked)
@@ -246,8 +246,8 @@ class RunProgress(Progress):
         self._attempt = attempt
         self._lease = lease
         self._also = also
-        known, _ = read_events(folder)
-        self._seq = max((int(event.get("seq", -1)) for event in known), default=-1)
+        events, _ = read_events(folder)
+        self._seq = max((int(event.get("seq", -1)) for event in events), default=-1)
         self._stage = ""
         self._stage_start = (0.0, 0)
         self._snapshot_time = -_SNAPSHOT_INTERVAL_S
@@ -482,13 +482,13 @@ class Attempt:
         if self._checkpointer is not None:
             seconds += self._checkpointer.earlier_s
             self._checkpointer = None
-        known: dict[str, Any] = {}
+        earlier: dict[str, Any] = {}
         for stage in self._stages:
-            known |= stage["files"]
+            earlier |= stage["files"]
         files = {
             rel: record
             for rel, record in self._hash_outputs().items()
-            if known.get(rel) != record and rel not in _ATTEMPT_FILES
+            if earlier.get(rel) != record and rel not in _ATTEMPT_FILES
         }
         self._stages = [stage for stage in self._stages if stage["name"] != name]
         self._stages.append(
@@ -586,8 +586,8 @@ class Attempt:
         content: dict[str, Any] = {"state": state, "attempt": self.number, "time": now()}
         if error is not None:
             kind = type(error).__name__ if isinstance(error, BaseException) else ""
-            told = describe(error) if isinstance(error, BaseException) else error
-            content |= {"error": told, "error_type": kind}
+            message = describe(error) if isinstance(error, BaseException) else error
+            content |= {"error": message, "error_type": kind}
         (self.run_folder / RESERVE).unlink(missing_ok=True)
         try:
             write_json(self.run_folder / EXIT, content)
@@ -608,9 +608,9 @@ class Attempt:
         for rel, path in artefacts(self.out):
             status = path.stat()
             key = (status.st_ino, status.st_size, status.st_mtime_ns)
-            known = self._records.get(rel)
-            is_same = known is not None and known[0] == key
-            records[rel] = known if known is not None and is_same else (key, file_record(path))
+            earlier = self._records.get(rel)
+            is_same = earlier is not None and earlier[0] == key
+            records[rel] = earlier if earlier is not None and is_same else (key, file_record(path))
         self._records = records
         return {rel: record for rel, (_, record) in records.items()}
 

@@ -216,11 +216,11 @@ def _check_alike(
     if odd:
         raise ValueError(f"array '{odd[0]}' is {'missing' if odd[0] in like else 'unknown'}.")
     for name, expected in like.items():
-        found, is_growing = tensors[name], name in growing
-        shape, wanted = found.shape[is_growing:], expected.shape[is_growing:]
-        if found.dtype != expected.dtype or found.ndim != expected.ndim or shape != wanted:
+        array, is_growing = tensors[name], name in growing
+        shape, wanted = array.shape[is_growing:], expected.shape[is_growing:]
+        if array.dtype != expected.dtype or array.ndim != expected.ndim or shape != wanted:
             raise ValueError(
-                f"array '{name}' is {found.dtype} {found.shape}; expected {expected.dtype} "
+                f"array '{name}' is {array.dtype} {array.shape}; expected {expected.dtype} "
                 f"{expected.shape}."
             )
     if len({len(tensors[name]) for name in growing}) > 1:

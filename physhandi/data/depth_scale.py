@@ -14,6 +14,6 @@ def likely_scales(scale: float) -> tuple[float, ...]:
     Returns:
         Known scales; the measured one, rounded, if none is near.
     """
-    off = {known: max(known / scale, scale / known) for known in KNOWN_SCALES}
-    near = sorted((known for known in KNOWN_SCALES if off[known] < _NEAR), key=off.__getitem__)
+    off = {one: max(one / scale, scale / one) for one in KNOWN_SCALES}
+    near = sorted((one for one in KNOWN_SCALES if off[one] < _NEAR), key=off.__getitem__)
     return tuple(near) or (float(f"{scale:.1g}"),)

@@ -1,4 +1,4 @@
-"""What a result was computed with: device, versions and the state of the source."""
+"""Environment of a computation: device, versions and the state of the source."""
 
 import os
 import platform

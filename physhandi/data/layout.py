@@ -13,7 +13,7 @@ SEARCH_FILE = "object/search.yaml"
 MATERIAL_FILE = "object/material.safetensors"
 """The object by itself: rest shape, springs, stiffness and damping."""
 SPLATS_FILE = "object/splats.safetensors"
-"""What the object looks like: splats bound to its nodes, if they were fitted."""
+"""Appearance of the object: splats bound to its nodes, if they were fitted."""
 SHAPE_FILE = "object/shape.yaml"
 """Kind of object that was found, and what was removed from the cloud that its nodes come from."""
 REST_NODE_FILE = "object/rest_node.npy"
@@ -34,7 +34,7 @@ class SequenceFiles:
 
     @property
     def meta(self) -> str:
-        """What a viewer needs of the recording."""
+        """Metadata of the recording that a viewer needs."""
         return f"{self.folder}/meta.yaml"
 
     @property
@@ -54,7 +54,7 @@ class SequenceFiles:
 
     @property
     def contacts(self) -> str:
-        """What the hands were found to hold, and when, if springs are attached over time."""
+        """Contacts of the hands over time, if springs are attached over time."""
         return f"{self.folder}/contacts.safetensors"
 
     @property
@@ -79,7 +79,7 @@ class SequenceFiles:
 
     @property
     def edits(self) -> str:
-        """What was done to single springs and nodes, if anything was."""
+        """Edits of single springs and nodes, if there are any."""
         return f"{self.folder}/edits.json"
 
     @property
@@ -98,7 +98,7 @@ class SequenceFiles:
         return f"{self.folder}/frame_errors.json"
 
     def observation(self, part: str) -> str:
-        """What was seen.
+        """Part of the observation of the object.
 
         Args:
             part: ``point``, ``is_visible``, ``is_motion_valid``, ``node_of_track``, ``cloud``,

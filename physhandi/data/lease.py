@@ -208,9 +208,9 @@ def _is_renewed(path: Path, claim: LeaseFile) -> bool:
     Whoever has looked before goes by what changed since; only the first look trusts the clocks.
     """
     content, clock = (claim["nonce"], claim["time"]), time.monotonic()
-    known = _watched.get(str(path))
-    if known is not None and known[0] == content:
-        return clock - known[1] < REMOTE_TIMEOUT_S
-    age = 0.0 if known is not None else min(max(0.0, time.time() - claim["time"]), REMOTE_TIMEOUT_S)
+    seen = _watched.get(str(path))
+    if seen is not None and seen[0] == content:
+        return clock - seen[1] < REMOTE_TIMEOUT_S
+    age = 0.0 if seen is not None else min(max(0.0, time.time() - claim["time"]), REMOTE_TIMEOUT_S)
     _watched[str(path)] = (content, clock - age)
     return age < REMOTE_TIMEOUT_S

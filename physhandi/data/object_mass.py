@@ -1,4 +1,4 @@
-"""What an object weighs: as its recording says, or estimated from its size and kind."""
+"""Mass of an object: as its recording says, or estimated from its size and kind."""
 
 import math
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ _SIZE = {1: (1e2, "cm"), 2: (1e4, "cm²"), 3: (1e6, "cm³")}
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectMass:
-    """What an object weighs.
+    """Mass of an object.
 
     Each node of the model has a mass of 1 kg, as in PhysTwin, so that its forces are those of an
     object of `node_count` kilograms. Divided by the mass of all nodes and multiplied by what the

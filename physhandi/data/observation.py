@@ -1,4 +1,4 @@
-"""What was seen of the object: tracked points and a cloud per frame."""
+"""Observation of the object: tracked points and a cloud per frame."""
 
 from dataclasses import dataclass
 
@@ -55,8 +55,8 @@ class ObjectObservation:
 
 def evenly(count: int, most: int | None) -> Int[ndarray, " kept"]:
     """Choose so many of `count` things at most, evenly spread, first and last included."""
-    kept = count if most is None else min(most, count)
-    return np.linspace(0, count - 1, kept).round().astype(int)
+    number = count if most is None else min(most, count)
+    return np.linspace(0, count - 1, number).round().astype(int)
 
 
 def thinned(cloud: Float[ndarray, "point 3"], most: int | None) -> Float32[ndarray, "kept 3"]:

@@ -168,12 +168,14 @@ class RunFolder:
             raise RunError(f"{path} is not a run: it needs {RUN} and {JOB}.")
         job, about = read_yaml(path / JOB), read_yaml(path / RUN)
         for file, content in ((JOB, job), (RUN, about)):
-            found = (named_fields(content) or {}).get("format")
-            if found != RUN_FORMAT:
-                told = ""
-                if isinstance(found, str) and found.startswith(RUN_FORMAT.partition("/")[0]):
-                    told = f", but {found[:40]}: update the program to read it"
-                raise RunError(f"{path / file} is not in format {RUN_FORMAT}{told}.")
+            file_format = (named_fields(content) or {}).get("format")
+            if file_format != RUN_FORMAT:
+                advice = ""
+                if isinstance(file_format, str) and file_format.startswith(
+                    RUN_FORMAT.partition("/")[0]
+                ):
+                    advice = f", but {file_format[:40]}: update the program to read it"
+                raise RunError(f"{path / file} is not in format {RUN_FORMAT}{advice}.")
         return cls.of_content(path, job, about)
 
     @classmethod
@@ -208,7 +210,7 @@ class RunFolder:
 
     @property
     def state(self) -> RunState:
-        """How far the run is."""
+        """State of the run."""
         # Looked for before the lease, which an attempt takes first: one that begins between the two
         # looks has not failed.
         was_begun = bool(attempt_numbers(self.folder))
@@ -225,7 +227,7 @@ class RunFolder:
 
     @property
     def error(self) -> str | None:
-        """What went wrong in a failed run."""
+        """Error of a failed run."""
         if self.state != "failed":
             return None
         end = read_record(self.folder / EXIT, ExitFile) or {}

@@ -277,7 +277,7 @@ def _told(problem: str) -> str:
         field, what = place.partition("`$.")[2].rstrip("`") or "it", "A name of a field is no text"
     if lost:
         return f"field '{f'{field}.' if field else ''}{lost[1]}' is missing"
-    what = re.sub(r"`([^`]*)`", lambda found: _kinds(found[1]), what)
+    what = re.sub(r"`([^`]*)`", lambda match: _kinds(match[1]), what)
     what = re.sub(r"^Invalid enum value (.*)", r"\1 is not known", what)
     what = what[:1].lower() + what[1:]
     return f"field '{field}' is wrong ({what})" if field else what

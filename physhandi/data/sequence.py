@@ -377,7 +377,7 @@ class Sequence:
 
     @property
     def description(self) -> str:
-        """What is to be seen."""
+        """Description of the recorded scene."""
         return self.meta.description
 
     @property
@@ -437,12 +437,12 @@ class Sequence:
 
     @property
     def mass(self) -> float | None:
-        """What the object weighs [kg]; None if nobody weighed it."""
+        """Mass of the object [kg]; None if nobody weighed it."""
         return self.meta.mass
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        """Where the recording comes from."""
+        """Provenance of the recording."""
         return self.meta.provenance
 
     @property

@@ -50,7 +50,7 @@ class SequenceMeta:
     frame_count: int
     """Number of frames."""
     description: str = ""
-    """What is to be seen, in one or two sentences."""
+    """Description of the recorded scene, in one or two sentences."""
     metric: bool = True
     """Whether lengths are metres; otherwise one unit is whatever `length_unit` says."""
     length_unit: str = "m"
@@ -76,7 +76,7 @@ class SequenceMeta:
     shape: ShapeClass | None = None
     """Kind of object; None if that is to be found from what the first frame shows."""
     mass: float | None = None
-    """What the object weighs [kg]; None if nobody weighed it."""
+    """Mass of the object [kg]; None if nobody weighed it."""
 
     @property
     def reconstruction_count(self) -> int:
@@ -144,9 +144,9 @@ def read_meta(folder: Path) -> SequenceMeta:
 def parse_meta(content: Any, where: str) -> SequenceMeta:
     """Check the content of ``sequence.yaml``; `where` starts each message."""
     fields = _Fields(content, f"{where}: {FILE}")
-    found = fields.take("format", str)
-    if found != FORMAT:
-        fields.fail("format", found, f"{FORMAT!r}; this version reads no other")
+    file_format = fields.take("format", str)
+    if file_format != FORMAT:
+        fields.fail("format", file_format, f"{FORMAT!r}; this version reads no other")
     frame_count = fields.whole("frame_count", least=1, most=_MOST_FRAMES)
     split = _Fields(fields.take("split", dict, {}), f"{where}: {FILE}: split")
     default = default_reconstruction_count(frame_count)

@@ -186,7 +186,7 @@ class SequenceWriter:
         """Read what can be trusted: whole lines whose files have the size that was noted."""
         path = self._temporary / _CHECKPOINTS
         text = path.read_text("utf-8") if path.is_file() else ""
-        kept: list[str] = []
+        lines: list[str] = []
         states: list[Any] = []
         for line in text.splitlines():
             try:
@@ -197,9 +197,9 @@ class SequenceWriter:
                 break
             if not is_whole:
                 break
-            kept.append(line + "\n")
+            lines.append(line + "\n")
             states.append(entry["state"])
-        path.write_text("".join(kept), "utf-8")
+        path.write_text("".join(lines), "utf-8")
         return states
 
     def _path(self, rel: str) -> Path:
@@ -276,13 +276,13 @@ def interrupted_replacements(root: Path) -> list[Path]:
     Returns:
         Where they belong; they lie beside that as ``.<name>.replaced``.
     """
-    found: list[Path] = []
+    folders: list[Path] = []
     for replaced in sorted(root.glob(".*.replaced")):
         folder = root / replaced.name.removeprefix(".").removesuffix(".replaced")
         is_written = any(not is_abandoned(path) for path in root.glob(f".{folder.name}.*.tmp"))
         if not folder.exists() and not is_written:
-            found.append(folder)
-    return found
+            folders.append(folder)
+    return folders
 
 
 def _recover(folder: Path) -> None:

@@ -340,8 +340,8 @@ class _Video:
             if not self._capture.grab():
                 return None
             self._next += 1
-        found, image = self._capture.read()
-        if not found:
+        is_read, image = self._capture.read()
+        if not is_read:
             return None
         self._next = frame + 1
         self._cache[frame] = image

@@ -499,7 +499,7 @@ def _profile_file(path: Path, extended: tuple[Path, ...] = ()) -> PipelineConfig
         )
     config = PipelineConfig.from_dict(merged)
     if clashes := _clashes(config):
-        raise SettingsError({place: f"{path}: {told}" for place, told in clashes.items()})
+        raise SettingsError({place: f"{path}: {message}" for place, message in clashes.items()})
     return config
 
 
@@ -613,9 +613,9 @@ class Setting:
     title: str
     """Its path in words, such as ``appearance / enabled``; of an interval, what is searched."""
     about: str
-    """What it means, in a sentence."""
+    """Meaning, in a sentence."""
     unit: str
-    """What it is measured in; empty for a mere number."""
+    """Unit; empty for a mere number."""
     kind: SettingKind
     """``interval`` is ``{low, high, scale}`` of a searched parameter, taken as it is unless it says
     ``is_scaled``."""

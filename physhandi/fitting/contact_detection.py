@@ -196,13 +196,13 @@ def _pairs(
     table = np.concatenate(pairs) if pairs else np.zeros((0, 5))
     interval = table[:, 3:].astype(np.int64)
     rank = _ranks(table[:, 0], table[:, 1], interval)
-    kept = rank < MOST_PAIRS
+    is_used = rank < MOST_PAIRS
     return ContactIntervals(
-        node=table[kept, 2].astype(np.int32),
-        control=table[kept, 0].astype(np.int32),
-        distance=table[kept, 1].astype(np.float32),
-        rank=rank[kept].astype(np.int32),
-        interval=interval[kept].astype(np.int32),
+        node=table[is_used, 2].astype(np.int32),
+        control=table[is_used, 0].astype(np.int32),
+        distance=table[is_used, 1].astype(np.float32),
+        rank=rank[is_used].astype(np.int32),
+        interval=interval[is_used].astype(np.int32),
     )
 
 
@@ -306,7 +306,7 @@ def _contacts_of(
     free = is_near.copy()
     away = np.linalg.norm(local - local[frame, frame][:, None], axis=-1)
     told_before = np.concatenate([[0], is_told.cumsum()])
-    found: list[tuple[int, int]] = []
+    contacts: list[tuple[int, int]] = []
     while free.any():
         blocked = ~((away < tolerance[:, None]) & free)
         first = np.where(blocked & (frame <= frame[:, None]), frame, -1).max(axis=1) + 1
@@ -322,16 +322,16 @@ def _contacts_of(
         seed = longest[np.argmin(drift)]
         begin, end = int(first[seed]), int(last[seed])
         free[begin : end + 1] = False
-        told = begin + np.flatnonzero(is_told[begin : end + 1])
-        place = local[seed, told]
+        observed = begin + np.flatnonzero(is_told[begin : end + 1])
+        place = local[seed, observed]
         off = np.linalg.norm(place - np.median(place, axis=0), axis=1) / tolerance[seed]
-        attached = told[off < max(LATE, 1.001 * off.min())]
-        holding = told[off < max(EARLY, 1.001 * off.min())]
+        attached = observed[off < max(LATE, 1.001 * off.min())]
+        holding = observed[off < max(EARLY, 1.001 * off.min())]
         begin = 0 if holding[0] == 0 else int(attached[0])
         end = end if end == count - 1 else int(holding[-1])
         if begin < end:
-            found.append((begin, end))
-    return sorted(found)
+            contacts.append((begin, end))
+    return sorted(contacts)
 
 
 def _runs_without(held: list[tuple[int, int, int]], last: int) -> list[tuple[int, int]]:

@@ -171,8 +171,8 @@ def observed_keypoints(
     keypoint = {view.name: view.keypoint for view in sequence.views}
     searched = [view for view in sequence.views if keypoint[view.name] is None and view.has_color]
     if searched:
-        found = detect_sequence(sequence, progress, views=searched)
-        keypoint |= {view.name: one for view, one in zip(searched, found, strict=True)}
+        detected = detect_sequence(sequence, progress, views=searched)
+        keypoint |= {view.name: one for view, one in zip(searched, detected, strict=True)}
     return np.stack([blank if one is None else one for one in keypoint.values()])
 
 
@@ -337,9 +337,9 @@ class HandProblem:
 
     def _search(self, hand: SearchedHand, step: _Step) -> None:
         """Begin with what a search finds."""
-        found = search_hand(hand, self.config, lambda number, loss: step(number, loss, None))
+        fitted = search_hand(hand, self.config, lambda number, loss: step(number, loss, None))
         with torch.no_grad():
-            for name, value in found.items():
+            for name, value in fitted.items():
                 self.parameters[name].copy_(value)
 
     def _fit(self, step: _Step, resumed: SavedState | None) -> None:
@@ -445,10 +445,12 @@ class HandProblem:
         if depth is None:
             return {}
         vertex, normal = depth.vertex, depth.normal
-        known = np.zeros(depth.weight.shape, np.int64) if vertex is None else vertex.numpy().copy()
+        vertices = (
+            np.zeros(depth.weight.shape, np.int64) if vertex is None else vertex.numpy().copy()
+        )
         normals = np.zeros(depth.point.shape, np.float32)
         return {
-            "depth.vertex": known,
+            "depth.vertex": vertices,
             "depth.normal": normals if normal is None else normal.numpy().copy(),
             "depth.age": np.array([-1 if vertex is None else depth.age]),
         }

@@ -73,7 +73,7 @@ class ObjectProblem:
     surface_count: int | None = None
     """Leading nodes that lie on the surface, which alone enter the Chamfer term; None for all."""
     contacts: ContactIntervals | None = None
-    """What the hands touch, and when; None for what is near them at frame 0, always."""
+    """Contacts of the hands over time; None for contact with all that is near them at frame 0."""
 
     @property
     def frame_count(self) -> int:

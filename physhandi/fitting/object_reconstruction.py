@@ -87,11 +87,16 @@ def search_object(
         models = [build_problem_model(problem, start) for problem in problems]
         needed = settle_substeps(models, start, config).substeps_per_frame
         config = config.replace(most_substeps=max(config.most_substeps, 2 * needed))
-    known = _KnownLosses(checkpointer or Checkpointer())
+    known_losses = _KnownLosses(checkpointer or Checkpointer())
     evaluate = CandidateEvaluator(
-        problems, config, progress, device=device, more_devices=more_devices, known=known
+        problems,
+        config,
+        progress,
+        device=device,
+        more_devices=more_devices,
+        known_losses=known_losses,
     )
-    return search_parameters(evaluate, start, search, _ResumedSearch(progress, known))
+    return search_parameters(evaluate, start, search, _ResumedSearch(progress, known_losses))
 
 
 class _KnownLosses:
@@ -155,8 +160,8 @@ def _digests(candidates: Many[SimulationParameters]) -> ndarray:
 class _ResumedSearch(Progress):
     """Hears of the generations after those whose losses were known, and where these ended."""
 
-    def __init__(self, progress: Progress, known: _KnownLosses) -> None:
-        self._progress, self._known = progress, known
+    def __init__(self, progress: Progress, known_losses: _KnownLosses) -> None:
+        self._progress, self._known_losses = progress, known_losses
 
     def report(
         self,
@@ -166,10 +171,10 @@ class _ResumedSearch(Progress):
         loss: float | None = None,
         message: str = "",
     ) -> None:
-        if self._known.is_recalling:
+        if self._known_losses.is_recalling:
             return
-        if self._known.resumed is not None:
-            self._known.resumed = None
+        if self._known_losses.resumed is not None:
+            self._known_losses.resumed = None
             message = resumed_note(iteration)
         self._progress.report(stage, iteration, total, loss, message)
 
@@ -297,7 +302,7 @@ class CandidateEvaluator:
         device: str = "cpu",
         more_devices: Many[str] = (),
         threads: int | None = None,
-        known: _KnownLosses | None = None,
+        known_losses: _KnownLosses | None = None,
     ) -> None:
         """Prepare the observations of all sequences.
 
@@ -310,7 +315,7 @@ class CandidateEvaluator:
                 but in the same way every time.
             threads: Candidates at once on a CPU; None for as many as processors. The bits are the
                 same.
-            known: Losses that need not be computed again; None for none.
+            known_losses: Losses that need not be computed again; None for none.
         """
         self._threads = threads or processor_count()
         self._problems, self._config, self._progress = problems, config, progress
@@ -319,7 +324,7 @@ class CandidateEvaluator:
         self._preview = RolloutPreview(SEARCH_STAGE, progress)
         self._best_loss = np.inf
         self._best: SimulationParameters | None = None
-        self._known = known or _KnownLosses(Checkpointer())
+        self._known_losses = known_losses or _KnownLosses(Checkpointer())
 
     def __call__(
         self, candidates: Many[SimulationParameters]
@@ -330,20 +335,20 @@ class CandidateEvaluator:
         the configuration allows.
         """
         candidates = [problem_parameters(p, self._problems[0]) for p in candidates]
-        known = self._known.recall(candidates)
-        if known is None:
+        recalled = self._known_losses.recall(candidates)
+        if recalled is None:
             settled, mean = self._evaluate(candidates)
-            self._known.add(candidates, settled, mean)
+            self._known_losses.add(candidates, settled, mean)
         else:
             settled = [
                 parameters.replace(substeps_per_frame=substeps)
-                for parameters, (substeps, _) in zip(candidates, known, strict=True)
+                for parameters, (substeps, _) in zip(candidates, recalled, strict=True)
             ]
-            mean = [loss for _, loss in known]
+            mean = [loss for _, loss in recalled]
         winner = int(np.argmin(mean))
         if mean[winner] < self._best_loss:
             self._best_loss, self._best = mean[winner], settled[winner]
-        if not self._known.is_recalling:
+        if not self._known_losses.is_recalling:
             self._show_best()
         return list(zip(settled, mean, strict=True))
 

@@ -101,30 +101,32 @@ def place_object(
     config = settings_of_fit(run)
     hands = reconstruct_hands(sequence, config.hand, progress) if sequence.hands else None
     observation = observe_object(sequence, progress)
-    known, parameters, rest_node = fitted
-    node, _, _ = object_nodes_of(sequence, observation, config, (known.object_node, rest_node))
+    fitted_model, parameters, rest_node = fitted
+    node, _, _ = object_nodes_of(
+        sequence, observation, config, (fitted_model.object_node, rest_node)
+    )
     is_bent = config.object_.bends_into_place and sequence.object_node is None
     if is_bent:
         node = bend_object(node, _first_cloud(sequence, observation), sequence.ground_height)
     velocity = np.zeros_like(node)
     if not config.object_.starts_at_rest:
         velocity = initial_velocity(observation, node, sequence.frame_rate)
-    clearance = known.clearance
+    clearance = fitted_model.clearance
     if config.object_.rests_where_seen:
         # Heights in another pose: here nodes rest where they are seen here.
         kind, thickness = artefacts.load_shape(run.out)
         clearance = resting_clearance(node, sequence.ground_height, kind, thickness=thickness)
     motions = () if hands is None else hands.motions
-    control = control_trajectory_of(sequence, motions, config, is_rod=known.rod is not None)
+    control = control_trajectory_of(sequence, motions, config, is_rod=fitted_model.rod is not None)
     world = parameters.in_world(
         frame_rate=sequence.frame_rate,
         ground_height=sequence.ground_height,
         gravity=sequence.gravity,
     )
-    laid = replace(known, object_node=node, initial_velocity=velocity, clearance=clearance)
+    laid = replace(fitted_model, object_node=node, initial_velocity=velocity, clearance=clearance)
     model = retopologize(laid, world, control[0], fitted=parameters, rest_node=rest_node)
     model = gripped(model)
-    if is_bent and np.array_equal(rest_node, known.object_node):
+    if is_bent and np.array_equal(rest_node, fitted_model.object_node):
         # The shape at frame 0 was its rest shape, in which springs carried it; so here.
         model = rest_in_place(model, world)
         if config.object_.holds_still:

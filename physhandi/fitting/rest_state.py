@@ -49,7 +49,8 @@ def resting_clearance(
 
     A node rests if it is near the ground and the lowest of its column; its clearance is its own
     height. Other nodes of a sheet or a rope come to lie as high as those that rest (the median of
-    them); others of a solid or a shell touch the ground themselves.
+    them), or as they were seen if that is lower: the ground would throw up what begins below its
+    clearance. Others of a solid or a shell touch the ground themselves.
 
     Args:
         node: Object nodes at frame 0 [m].
@@ -71,7 +72,7 @@ def resting_clearance(
     if not is_resting.any():
         return clearance
     if kind in {"sheet", "rope"}:
-        clearance[:] = np.median(height[is_resting])
+        clearance[:] = np.minimum(height, np.median(height[is_resting]))
     clearance[is_resting] = height[is_resting]
     return clearance
 

@@ -43,11 +43,11 @@ class SearchResult:
 
     @property
     def note(self) -> str:
-        """What the search did beyond its settings, in a sentence; empty if nothing."""
+        """Departures of the search from its settings, in a sentence; empty if there are none."""
         if not self.widened:
             return ""
-        told = (f"{name} to {interval_text(name, self.intervals[name])}" for name in self.widened)
-        return f"Ended at a bound and went on with wider intervals: {', '.join(told)}."
+        texts = (f"{name} to {interval_text(name, self.intervals[name])}" for name in self.widened)
+        return f"Ended at a bound and went on with wider intervals: {', '.join(texts)}."
 
 
 def search_parameters(

@@ -1,4 +1,4 @@
-"""What a run and a recording hold of a take of steered hands.
+"""Files of a take of steered hands, in a run and in a recording.
 
 A run of kind ``simulation`` that holds a take simulates that in the place of a recording, which is
 made of it first: control points and markers, one at each object node, with its provenance.
@@ -102,9 +102,9 @@ def contacts_from(contacts: ContactIntervals | None, frame: int) -> ContactInter
     """
     if contacts is None:
         return None
-    kept = acts_in(contacts.interval, frame + 1)
-    part = {field.name: getattr(contacts, field.name)[kept] for field in fields(contacts)}
-    return ContactIntervals(**part | {"interval": always(int(kept.sum()))})
+    holds = acts_in(contacts.interval, frame + 1)
+    part = {field.name: getattr(contacts, field.name)[holds] for field in fields(contacts)}
+    return ContactIntervals(**part | {"interval": always(int(holds.sum()))})
 
 
 def contacts_in(model: SpringMassModel) -> ContactIntervals:

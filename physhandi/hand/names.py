@@ -1,4 +1,4 @@
-"""What hands are called: sides, kinds of models, keypoints and joints."""
+"""Names of hands: sides, kinds of models, keypoints and joints."""
 
 from typing import Literal
 

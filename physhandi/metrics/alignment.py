@@ -113,5 +113,5 @@ class _Held:
         """Where carriers of another frame take the points."""
         mean, target = self._about_mean(carrier[self.usable])
         turn = best_rotations(np.einsum("pc,pci,pcj->pij", self._weight, target, self._source))
-        found = np.einsum("pij,pj->pi", turn, self._offset) + mean
-        return np.where(self._is_known[:, None], found, np.nan)
+        point = np.einsum("pij,pj->pi", turn, self._offset) + mean
+        return np.where(self._is_known[:, None], point, np.nan)

@@ -19,14 +19,14 @@ FAR_OFF = 0.010
 
 
 def mask_scores(
-    found: Iterable[UInt8[ndarray, "row column"]], true: Iterable[UInt8[ndarray, "row column"]]
+    estimated: Iterable[UInt8[ndarray, "row column"]], true: Iterable[UInt8[ndarray, "row column"]]
 ) -> dict[str, float]:
     """Compare masks: mean over images of the intersection over union of object and hands.
 
     Images in which neither mask shows it are left out; all hands count as one.
 
     Args:
-        found: Masks of all frames and views.
+        estimated: Masks of all frames and views.
         true: What they should be, in the same order.
 
     Returns:
@@ -37,7 +37,7 @@ def mask_scores(
             intersection_over_union(one == _OBJECT, other == _OBJECT),
             intersection_over_union(one > _OBJECT, other > _OBJECT),
         )
-        for one, other in zip(found, true, strict=True)
+        for one, other in zip(estimated, true, strict=True)
     ]
     value = np.array(each).reshape(-1, 2)
     means = [column[np.isfinite(column)] for column in value.T]
@@ -92,12 +92,12 @@ def track_scores(
 
 
 def camera_scores(
-    found: Many[Float[ndarray, "4 4"]], true: Many[Float[ndarray, "4 4"]]
+    estimated: Many[Float[ndarray, "4 4"]], true: Many[Float[ndarray, "4 4"]]
 ) -> dict[str, float]:
     """Compare where cameras are from each other: that does not depend on the world's origin.
 
     Args:
-        found: Poses of the cameras, which map their coordinates to the world [m].
+        estimated: Poses of the cameras, which map their coordinates to the world [m].
         true: What they should be.
 
     Returns:
@@ -106,10 +106,10 @@ def camera_scores(
         what is.
     """
     offs = [
-        np.linalg.inv(np.linalg.inv(found[i]) @ found[j]) @ np.linalg.inv(true[i]) @ true[j]
-        for i, j in combinations(range(len(found)), 2)
+        np.linalg.inv(np.linalg.inv(estimated[i]) @ estimated[j]) @ np.linalg.inv(true[i]) @ true[j]
+        for i, j in combinations(range(len(estimated)), 2)
     ]
-    tilts = [_angle(one[2, :3], other[2, :3]) for one, other in zip(found, true, strict=True)]
+    tilts = [_angle(one[2, :3], other[2, :3]) for one, other in zip(estimated, true, strict=True)]
     return {
         "shift": max((float(np.linalg.norm(off[:3, 3])) for off in offs), default=0.0),
         "turn": max((_turn(off[:3, :3]) for off in offs), default=0.0),
@@ -118,21 +118,21 @@ def camera_scores(
 
 
 def along_the_table(
-    found: Many[Float[ndarray, "4 4"]], true: Many[Float[ndarray, "4 4"]], rise: float = 0.0
+    estimated: Many[Float[ndarray, "4 4"]], true: Many[Float[ndarray, "4 4"]], rise: float = 0.0
 ) -> Float[ndarray, "4 4"]:
     """Find the turn about z and the shift along the table that bring cameras best to their places.
 
     What falls and lies on a table does so alike wherever the origin on it is.
 
     Args:
-        found: Poses of the cameras [m].
+        estimated: Poses of the cameras [m].
         true: Where they should be, of the same cameras [m].
         rise: How much higher the table is there [m].
 
     Returns:
         What maps the world of the first to that of the second.
     """
-    pairs = list(zip(found, true, strict=True))
+    pairs = list(zip(estimated, true, strict=True))
     moment = np.sum([t[:3, :3] @ f[:3, :3].T for f, t in pairs], axis=0)
     yaw = np.arctan2(moment[1, 0] - moment[0, 1], moment[0, 0] + moment[1, 1])
     place = np.eye(4)

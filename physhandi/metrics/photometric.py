@@ -174,8 +174,8 @@ def structural_similarity(
 
 def _blurred(image: Float[ndarray, "row column channel"]) -> Float[ndarray, "row column channel"]:
     kernel = cv2.getGaussianKernel(WINDOW, SIGMA, cv2.CV_64F)
-    found = cv2.sepFilter2D(image, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_CONSTANT)
-    return found.reshape(image.shape)
+    blurred = cv2.sepFilter2D(image, cv2.CV_64F, kernel, kernel, borderType=cv2.BORDER_CONSTANT)
+    return blurred.reshape(image.shape)
 
 
 def _on_black(
@@ -196,8 +196,8 @@ def _box(where: Bool[ndarray, "row column"]) -> tuple[slice, slice]:
     """Bound the pixels, and all whose windows reach to one of them; one pixel if there are none."""
     slices: list[slice] = []
     for axis in (1, 0):
-        found = np.flatnonzero(where.any(axis=axis))
-        low, high = (int(found[0]), int(found[-1])) if len(found) else (0, 0)
+        numbers = np.flatnonzero(where.any(axis=axis))
+        low, high = (int(numbers[0]), int(numbers[-1])) if len(numbers) else (0, 0)
         slices.append(slice(max(0, low - WINDOW // 2), high + WINDOW // 2 + 1))
     return slices[0], slices[1]
 

@@ -391,8 +391,8 @@ def _judged(
 def _curves_of(motions: Motions, reference: ScoringReference) -> dict[str, Curves]:
     """Measure motions beside each other: searches for nearest points use a processor each."""
     with ThreadPoolExecutor(len(motions), thread_name_prefix="physhandi-metrics") as pool:
-        found = pool.map(partial(error_curves, reference=reference), motions.values())
-        return dict(zip(motions, found, strict=True))
+        curves = pool.map(partial(error_curves, reference=reference), motions.values())
+        return dict(zip(motions, curves, strict=True))
 
 
 def error_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringReference) -> Curves:

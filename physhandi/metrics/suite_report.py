@@ -131,7 +131,7 @@ class SuiteRow:
     method: str
     """Name of the method."""
     split: str
-    """What the figures are taken over."""
+    """Frames over which the figures are taken."""
     metric: str
     """Name of the metric."""
     mean: float
@@ -155,7 +155,7 @@ class Difference:
     against: str
     """The method that is subtracted."""
     split: str
-    """What the figures are taken over."""
+    """Frames over which the figures are taken."""
     metric: str
     """Name of the metric."""
     difference: float

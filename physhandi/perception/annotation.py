@@ -44,9 +44,9 @@ from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
 BUILT_IN = "built-in"
-"""What provenance calls masks and tracks that were made here."""
+"""Source of built-in masks and tracks in the provenance."""
 LENGTHS_ALONG = "lengths along it from its ends"
-"""What it says of tracks of a thin object, as of a rope."""
+"""Method of tracks of a thin object in the provenance."""
 _HASH = "model_sha256"
 """What it says of those that a model of the user made here."""
 _UNFINISHED = "unfinished"
@@ -178,11 +178,11 @@ def correct_masks(
     for one in corrections:
         masks[one.view][one.frame] = one.label
     about = named_fields(sequence.provenance.get("masks")) or {"source": "unknown"}
-    known = [entry for entry in map(named_fields, _listed(about, "corrections")) if entry]
+    earlier = [entry for entry in map(named_fields, _listed(about, "corrections")) if entry]
     if carries_on:
         clicks = [entry for entry in map(named_fields, _listed(about, "clicks")) if entry]
         fixed = {
-            view: [int(e["frame"]) for e in (*known, *clicks) if e.get("view") == view]
+            view: [int(e["frame"]) for e in (*earlier, *clicks) if e.get("view") == view]
             for view in right
         }
         fixed = {view: sorted(set(stay) - set(right[view])) for view, stay in fixed.items()}
@@ -202,20 +202,20 @@ def correct_masks(
     progress.check_cancelled()
     new = [{"view": one.view, "frame": one.frame, "carried_on": carries_on} for one in corrections]
     done = {(entry["view"], entry["frame"]) for entry in new}
-    kept = [e for e in known if (e.get("view"), e.get("frame")) not in done]
-    provenance = {**sequence.provenance, "masks": {**about, "corrections": [*kept, *new]}}
+    unchanged = [e for e in earlier if (e.get("view"), e.get("frame")) not in done]
+    provenance = {**sequence.provenance, "masks": {**about, "corrections": [*unchanged, *new]}}
     if of_tracks:
         provenance["tracks"] = of_tracks
     return _store(sequence, masks, tracks, provenance)
 
 
 def _palm_lengths(sequence: Sequence, detected: Mapping[str, ndarray]) -> dict[str, float]:
-    found = {
+    lengths = {
         view.name: palm_length(view, detected[view.name])
         for view in sequence.views
         if view.has_depth and view.name in detected
     }
-    return {name: round(length, 4) for name, length in found.items() if length is not None}
+    return {name: round(length, 4) for name, length in lengths.items() if length is not None}
 
 
 def _stored_masks(view: View) -> UInt8[ndarray, "frame row column"]:
@@ -260,12 +260,12 @@ def _check_correction(sequence: Sequence, one: Correction) -> None:
         raise UsageError(f"View '{one.view}' has no frame {one.frame}.")
     size = (view.camera.height, view.camera.width)
     allowed = {0, OBJECT_LABEL, *(HAND_LABEL[side] for side in sequence.hands)}
-    found = {int(value) for value in np.unique(one.label)}
-    if one.label.shape != size or not found <= allowed:
+    labels = {int(value) for value in np.unique(one.label)}
+    if one.label.shape != size or not labels <= allowed:
         raise UsageError(
             f"View '{one.view}', frame {one.frame}: a mask has {size[1]}x{size[0]} px of labels "
             f"{sorted(allowed)}, not {one.label.shape[1]}x{one.label.shape[0]} px of "
-            f"{sorted(found)}."
+            f"{sorted(labels)}."
         )
 
 

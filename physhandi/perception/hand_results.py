@@ -31,7 +31,7 @@ from physhandi.perception.keypoints import KeypointDetector, detect_view
 from physhandi.progress import NullProgress, Progress
 
 HANDS_FORMAT = "physhandi-hands/1"
-"""What a file of results says of itself."""
+"""Format name in a file of results."""
 _SIDES = ("right", "left")
 _MOST_BYTES = 1 << 30
 """Size of the largest file, unpacked, that is read [byte]."""
@@ -85,9 +85,9 @@ def import_hands(
     """
     sequence, path = Sequence.load(Path(folder)), Path(path)
     results = _Results(path, sequence)
-    found = results.keypoints()
+    keypoints = results.keypoints()
     views = {view.name: view for view in sequence.views}
-    for name, keypoint in found.items():
+    for name, keypoint in keypoints.items():
         camera = views[name].camera
         doubt = doubt_keypoints(keypoint, camera.width, camera.height)
         if doubt is not None:
@@ -97,22 +97,22 @@ def import_hands(
                 f"{sequence.hands[hand]} hand {what}."
             )
     if not overwrite:
-        _check_own_keypoints(sequence, list(found))
+        _check_own_keypoints(sequence, list(keypoints))
     if fills_gaps:
         detector = KeypointDetector()
-        for name, keypoint in found.items():
+        for name, keypoint in keypoints.items():
             view = views[name]
             if view.has_color and np.isnan(keypoint).any():
-                told = progress or NullProgress()
-                detected = detect_view(view, sequence.hands, told, detector)
+                watch = progress or NullProgress()
+                detected = detect_view(view, sequence.hands, watch, detector)
                 is_gap = np.isnan(keypoint).all(axis=(2, 3))
                 keypoint[is_gap] = detected[is_gap]
                 view.close()
-    for name, keypoint in found.items():
+    for name, keypoint in keypoints.items():
         write_array(views[name].folder / "keypoint.npy", keypoint)
     about = {
         "source": results.source,
-        "views": list(found),
+        "views": list(keypoints),
         "file_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "gaps_filled": fills_gaps,
         "version": physhandi.__version__,
@@ -182,7 +182,7 @@ class _Results:
         named = self._text.get("view")
         shown = list(dict.fromkeys(named)) if named is not None else list(views)
         shape = (self._sequence.frame_count, len(self._sequence.hands), 21, 3)
-        found = {name: np.full(shape, np.nan, dtype=np.float32) for name in shown}
+        keypoints = {name: np.full(shape, np.nan, dtype=np.float32) for name in shown}
         best = {name: np.full(shape[:2], -1.0) for name in shown}
         sure = self._number.get("confidence", np.ones(self._count))
         joint = None if self._kind == "keypoint" else self._joints()
@@ -199,11 +199,11 @@ class _Results:
                     if np.isnan(pixel).any():
                         continue
                 best[name][frame, hand] = sure[number]
-                found[name][frame, hand, :, :2] = pixel[:, :2]
-                found[name][frame, hand, :, 2] = (
+                keypoints[name][frame, hand, :, :2] = pixel[:, :2]
+                keypoints[name][frame, hand, :, 2] = (
                     pixel[:, 2] if pixel.shape[1] == 3 else sure[number]
                 )
-        return found
+        return keypoints
 
     def _projected(
         self, view: View, joint: Float[ndarray, "21 3"], number: int
@@ -257,8 +257,8 @@ class _Results:
                     model.wrist_position(shape)[None],
                 )
                 with torch.no_grad():
-                    found = model.keypoints(*(torch.from_numpy(value) for value in given))
-                joint[number] = found[0].numpy() * ([-1, 1, 1] if mirrors else 1)
+                    posed = model.keypoints(*(torch.from_numpy(value) for value in given))
+                joint[number] = posed[0].numpy() * ([-1, 1, 1] if mirrors else 1)
         return joint + shift[:, None]
 
     def _rotations(self, name: str) -> Float[ndarray, "detection rotation 3"]:

@@ -12,7 +12,7 @@ from physhandi.data.observation import evenly
 from physhandi.data.view import View
 
 MEASURED_PALMS = "palm_length"
-"""What provenance calls the size of hands by keypoints that are not kept, by view [m]."""
+"""Provenance field of the palm lengths by view, by keypoints that are not stored [m]."""
 PALM_LENGTH = 0.085
 """From wrist to knuckles of a hand between a child's and a large one [m]."""
 PALM_LENGTHS = (0.06, 0.12)
@@ -52,8 +52,8 @@ def palm_length(view: View, keypoint: Float[ndarray, "frame hand 21 3"]) -> floa
             pixel = palm[frame, hand, :, :2]
             point = _lifted(view, pixel, _depth_at(depth, pixel), focal)
             length += np.linalg.norm(point[1:] - point[0], axis=1).tolist()
-    known = np.array(length)[np.isfinite(length)]
-    return float(np.median(known)) if len(known) >= _FEWEST else None
+    measured = np.array(length)[np.isfinite(length)]
+    return float(np.median(measured)) if len(measured) >= _FEWEST else None
 
 
 def is_impossible_palm(length: float) -> bool:
@@ -69,7 +69,7 @@ def _depth_at(
     depth: Float[ndarray, "row column"], pixel: Float[ndarray, "point 2"]
 ) -> Float[ndarray, " point"]:
     """Take the median of what was measured around pixels; NaN where nothing was [m]."""
-    found = np.full(len(pixel), np.nan)
+    medians = np.full(len(pixel), np.nan)
     for number in np.flatnonzero(np.isfinite(pixel).all(axis=1)):
         column, row = pixel[number].round().astype(int)
         if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
@@ -79,8 +79,8 @@ def _depth_at(
             max(0, column - _AROUND) : column + _AROUND + 1,
         ]
         if (around > 0).any():
-            found[number] = np.median(around[around > 0])
-    return found
+            medians[number] = np.median(around[around > 0])
+    return medians
 
 
 def _lifted(
@@ -91,11 +91,11 @@ def _lifted(
 ) -> Float[ndarray, "point 3"]:
     """Lift a palm's keypoints into the world; NaN where they see something else [m]."""
     point = np.full((len(pixel), 3), np.nan)
-    known = np.isfinite(depth)
-    if not known.any():
+    is_measured = np.isfinite(depth)
+    if not is_measured.any():
         return point
-    middle = np.median(depth[known])
-    apart = np.linalg.norm(pixel[known, None] - pixel[None, known], axis=-1).max()
-    known &= np.abs(np.nan_to_num(depth) - middle) <= apart * middle / focal
-    point[known] = view.camera.unproject(pixel[known], depth[known])
+    middle = np.median(depth[is_measured])
+    apart = np.linalg.norm(pixel[is_measured, None] - pixel[None, is_measured], axis=-1).max()
+    is_measured &= np.abs(np.nan_to_num(depth) - middle) <= apart * middle / focal
+    point[is_measured] = view.camera.unproject(pixel[is_measured], depth[is_measured])
     return point

@@ -266,8 +266,8 @@ def _follow_back(
         image = images.pop()
         others = [_detected(keypoint[frame, hand]) for hand in np.flatnonzero(here)]
         for hand, there in list(lost.items()):
-            found = detector.follow(image, [there], others)[len(others) :]
-            for one in found:
+            hands = detector.follow(image, [there], others)[len(others) :]
+            for one in hands:
                 keypoint[frame, hand, :, :2], keypoint[frame, hand, :, 2] = (
                     one.keypoint,
                     one.confidence,

@@ -87,7 +87,7 @@ class MaskModel:
         self._torch = torch
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
-            model, told = getattr(transformers, name).from_pretrained(
+            model, loading_info = getattr(transformers, name).from_pretrained(
                 folder,
                 local_files_only=True,
                 trust_remote_code=False,
@@ -98,7 +98,10 @@ class MaskModel:
         except Exception as error:  # noqa: BLE001 - its reader lets nearly anything out
             reason = " ".join(str(error).split())[:300]
             raise UsageError(f"{folder}: the model cannot be read ({reason}). {_REMEDY}") from None
-        lacking = [*told["missing_keys"], *(str(key) for key in told["mismatched_keys"])]
+        lacking = [
+            *loading_info["missing_keys"],
+            *(str(key) for key in loading_info["mismatched_keys"]),
+        ]
         if lacking:
             raise UsageError(
                 f"{folder}: {len(lacking)} weights are missing or of another size, among them "
@@ -131,7 +134,7 @@ class MaskModel:
         frames = _Frames(view, self._size)
         memory: Any = None
         sessions: dict[int, Any] = {}
-        for thing, known in prompts.items():
+        for thing, own in prompts.items():
             session = self._session(
                 video_height=view.camera.height,
                 video_width=view.camera.width,
@@ -142,10 +145,10 @@ class MaskModel:
             session.processed_frames = frames
             # One look at an image serves for all things.
             memory = session.cache = memory or session.cache
-            for prompt in known:
+            for prompt in own:
                 self._tell(session, view, prompt)
             sessions[thing] = session
-        first = {thing: known[0].frame for thing, known in prompts.items()}
+        first = {thing: own[0].frame for thing, own in prompts.items()}
         logits: dict[int, dict[int, ndarray]] = {frame: {} for frame in range(view.frame_count)}
         ahead = [(frame, False) for frame in range(min(first.values()), view.frame_count)]
         back = [(frame, True) for frame in range(max(first.values()) - 1, -1, -1)]
@@ -176,12 +179,12 @@ class MaskModel:
     def _step(
         self, session: Any, view: View, frame: int, *, is_back: bool
     ) -> Float[ndarray, "row column"]:
-        found = self._model(session, frame_idx=frame, reverse=is_back).pred_masks
+        masks = self._model(session, frame_idx=frame, reverse=is_back).pred_masks
         past = session.output_dict_per_obj[0]["non_cond_frame_outputs"]
         for other in [other for other in past if abs(other - frame) > _REMEMBERED]:
             del past[other]
         logit = self._torch.nn.functional.interpolate(
-            found.float(), (view.camera.height, view.camera.width), mode="bilinear"
+            masks.float(), (view.camera.height, view.camera.width), mode="bilinear"
         )
         return logit[0, 0].cpu().numpy()
 
@@ -237,8 +240,8 @@ def _described(folder: Path) -> tuple[str, list[Path]]:
             f"{_REMEDY}"
         ) from None
     if kind not in _ARCHITECTURES:
-        known = " and ".join(_ARCHITECTURES)
-        raise UsageError(f"{folder}: holds a '{kind}'; {known} are understood. {_REMEDY}")
+        names = " and ".join(_ARCHITECTURES)
+        raise UsageError(f"{folder}: holds a '{kind}'; {names} are understood. {_REMEDY}")
     weights = sorted(folder.glob("*.safetensors"))
     if not weights:
         raise UsageError(

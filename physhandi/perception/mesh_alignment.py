@@ -92,7 +92,7 @@ class Alignment:
 
 
 class SeenSpace:
-    """What all views say of the space around an object in one frame."""
+    """Space around an object in one frame, as all views see it."""
 
     def __init__(self, views: Many[View], frame: int) -> None:
         """Read masks and depth of a frame.
@@ -166,18 +166,18 @@ def align_mesh(
         FitError: If no alignment explains what was seen; tells how far the best one is from it.
     """
     search = _Search(vertex, faces, cloud.astype(np.float64), space, scale)
-    found = search.run(start, middle)
-    if found.coverage < LEAST_COVERAGE or found.outside > MOST_OUTSIDE:
+    fit = search.run(start, middle)
+    if fit.coverage < LEAST_COVERAGE or fit.outside > MOST_OUTSIDE:
         raise FitError(
-            f"The mesh does not fit to what frame 0 shows. At best {100 * found.coverage:.0f} % of "
-            f"the cloud lie within {1e3 * found.tolerance:.0f} mm of it "
+            f"The mesh does not fit to what frame 0 shows. At best {100 * fit.coverage:.0f} % of "
+            f"the cloud lie within {1e3 * fit.tolerance:.0f} mm of it "
             f"({100 * LEAST_COVERAGE:.0f} % are needed; the median distance is "
-            f"{1e3 * found.residual:.1f} mm), and {100 * found.outside:.0f} % of its surface are "
+            f"{1e3 * fit.residual:.1f} mm), and {100 * fit.outside:.0f} % of its surface are "
             f"where views see nothing ({100 * MOST_OUTSIDE:.0f} % are allowed). Use a mesh of the "
             "object in the shape that it has in frame 0, check the masks of that frame, or tell "
             "about how it lies (--pose) and how large it is (--scale)."
         )
-    return found
+    return fit
 
 
 class _Search:
@@ -241,8 +241,8 @@ class _Search:
         if len(chosen) > cloud_count:
             chosen = np.sort(random.choice(chosen, cloud_count, replace=False))
         samples = self._samples
-        kept = random.permutation(len(samples.point))[:sample_count]
-        part = replace(samples, point=samples.point[kept], normal=samples.normal[kept])
+        picked = random.permutation(len(samples.point))[:sample_count]
+        part = replace(samples, point=samples.point[picked], normal=samples.normal[picked])
         return self._cloud[chosen], self._normal[chosen], part
 
     def _descend(
@@ -379,12 +379,12 @@ def _equations(
 
 def _different(poses: list[Alignment]) -> list[Alignment]:
     """Keep the first of those that have come to nearly the same rotation."""
-    kept: list[Alignment] = []
+    different: list[Alignment] = []
     for pose in poses:
-        turns = [other.rotation.T @ pose.rotation for other in kept]
+        turns = [other.rotation.T @ pose.rotation for other in different]
         if all(Rotation.from_matrix(turn).magnitude() > _SAME for turn in turns):
-            kept.append(pose)
-    return kept
+            different.append(pose)
+    return different
 
 
 def _rotations(start: Rotation | None) -> list[Rotation]:

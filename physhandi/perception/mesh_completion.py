@@ -98,16 +98,16 @@ def complete_shape(
     rotation, middle = (None, None) if pose is None else (pose.rotation, pose.middle)
     space = SeenSpace([view for view in sequence.views if view.has_mask], 0)
     try:
-        found = align_mesh(
+        alignment = align_mesh(
             mesh.vertex, mesh.faces, cloud, space, scale=scale, start=rotation, middle=middle
         )
     except FitError as error:
         raise FitError(f"Sequence '{sequence.name}', mesh {mesh_file}: {error}") from None
-    vertex = found.apply(mesh.vertex)
+    vertex = alignment.apply(mesh.vertex)
     faces = _seen_from_outside(vertex, mesh.faces)
     color = paint_mesh(vertex, faces, sequence.views, own=mesh.color)
-    _store(sequence, Path(mesh_file), found, (vertex, faces, color))
-    return found
+    _store(sequence, Path(mesh_file), alignment, (vertex, faces, color))
+    return alignment
 
 
 def _first_cloud(sequence: Sequence, views: list[View]) -> Float[ndarray, "point 3"]:
@@ -201,7 +201,7 @@ def paint_mesh(
 def _store(
     sequence: Sequence,
     mesh_file: Path,
-    found: Alignment,
+    alignment: Alignment,
     mesh: tuple[ndarray, ndarray, ndarray | None],
 ) -> None:
     """Replace the mesh of a sequence; one that is half there is no valid sequence."""
@@ -215,7 +215,7 @@ def _store(
     about = {
         "source": mesh_file.name,
         "sha256": hashlib.sha256(mesh_file.read_bytes()).hexdigest(),
-        **found.to_dict(),
+        **alignment.to_dict(),
         "version": physhandi.__version__,
     }
     meta = dataclasses.replace(sequence.meta, provenance={**sequence.provenance, "mesh": about})

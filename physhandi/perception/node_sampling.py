@@ -217,14 +217,14 @@ def _filling(
         normal: Direction of the surface's normal at each; zero if it is not known.
         spacing: Distance between neighbouring nodes [m].
     """
-    kept: list[int] = []
+    chosen: list[int] = []
     for index, (point, axis) in enumerate(zip(bridge, normal, strict=True)):
-        offset = bridge[kept] - point
+        offset = bridge[chosen] - point
         beside = offset - np.outer(offset @ axis, axis)
         is_near = (beside**2).sum(axis=1) < (_PACKING * spacing) ** 2
         if not (is_near & ((offset**2).sum(axis=1) < MAX_GAP**2)).any():
-            kept.append(index)
-    filling, axis = bridge[kept].copy(), normal[kept]
+            chosen.append(index)
+    filling, axis = bridge[chosen].copy(), normal[chosen]
     count = min(_AROUND, len(node) + len(filling))
     for _ in range(_DRAWN):
         every = np.concatenate([node, filling])

@@ -56,7 +56,7 @@ class Removal:
     """Points that are not the object."""
 
     reason: Reason
-    """Why they are not."""
+    """Reason for which they are not."""
     count: int
     """How many they are."""
     distance: float

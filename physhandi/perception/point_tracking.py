@@ -157,7 +157,7 @@ class _Tracker:
         self._gray[frame] = gray
         if self._alive:
             self._advance(frame, is_object, depth)
-        count, known = len(self._alive), len(self._paths)
+        count, first_new = len(self._alive), len(self._paths)
         if count < (MOST_TRACKS if not self._paths else LEAST_TRACKS):
             start = np.array([self._paths[track].pixel[-1] for track in self._alive])
             for pixel in _new_points(gray, is_object & (depth > 0), start.reshape(-1, 2)):
@@ -169,7 +169,7 @@ class _Tracker:
                 del images[image]
         pixel = np.array([self._paths[track].pixel[-1] for track in self._alive])
         self._depth = pixel_values(depth, pixel.reshape(-1, 2))
-        self._tie(pixel.reshape(-1, 2), np.array(self._alive, dtype=np.int64) >= known)
+        self._tie(pixel.reshape(-1, 2), np.array(self._alive, dtype=np.int64) >= first_new)
 
     def _advance(
         self,
@@ -267,9 +267,9 @@ class _Tracker:
     def paths(self) -> tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]:
         """Lay the tracks that lived long enough side by side."""
         least = min(SHORTEST_TRACK, self._view.frame_count)
-        kept = [path for path in self._paths if len(path.pixel) >= least]
-        pixel = np.full((self._view.frame_count, len(kept), 2), np.nan, dtype=np.float32)
-        for track, path in enumerate(kept):
+        long_enough = [path for path in self._paths if len(path.pixel) >= least]
+        pixel = np.full((self._view.frame_count, len(long_enough), 2), np.nan, dtype=np.float32)
+        for track, path in enumerate(long_enough):
             pixel[path.begin : path.begin + len(path.pixel), track] = path.pixel
         return pixel, np.asarray(np.isfinite(pixel).all(axis=-1))
 
@@ -319,8 +319,8 @@ def _followed_by_model(
         is_visible = visible_on_object(mask, place, is_visible)
         pixel = np.concatenate([pixel, place.astype(np.float32)], axis=1)
         seen = np.concatenate([seen, is_visible], axis=1)
-    kept = seen.sum(axis=0) >= min(SHORTEST_TRACK, view.frame_count)
-    pixel, seen = pixel[:, kept], seen[:, kept]
+    is_long = seen.sum(axis=0) >= min(SHORTEST_TRACK, view.frame_count)
+    pixel, seen = pixel[:, is_long], seen[:, is_long]
     return np.where(seen[..., None], pixel, np.float32(np.nan)), seen
 
 
@@ -376,12 +376,12 @@ def _follow(
     if guess is not None:
         options |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
         there = guess.astype(np.float32).reshape(-1, 1, 2)
-    end, found, _ = _cv2.calcOpticalFlowPyrLK(before, now, first, there, **options)
+    end, reached, _ = _cv2.calcOpticalFlowPyrLK(before, now, first, there, **options)
     # The way back begins as far from its end as the way there did.
     back_there = None if guess is None else first + end - guess.reshape(-1, 1, 2).astype(np.float32)
-    back, found_back, _ = _cv2.calcOpticalFlowPyrLK(now, before, end, back_there, **options)
+    back, came_back, _ = _cv2.calcOpticalFlowPyrLK(now, before, end, back_there, **options)
     far = np.linalg.norm((back - first).reshape(-1, 2), axis=1)
-    is_found = (found.reshape(-1) > 0) & (found_back.reshape(-1) > 0) & (far < returns)
+    is_found = (reached.reshape(-1) > 0) & (came_back.reshape(-1) > 0) & (far < returns)
     return end.reshape(-1, 2), is_found
 
 
@@ -419,14 +419,14 @@ def _new_points(
     for x, y in taken.round().astype(int):
         cv2.circle(room, (int(x), int(y)), round(distance), 0, -1)
     corner = _cv2.goodFeaturesToTrack(gray, wanted, 0.001, distance, mask=room, blockSize=3)
-    found = np.zeros((0, 2)) if corner is None else corner.reshape(-1, 2).astype(np.float64)
-    for x, y in found.round().astype(int):
+    corners = np.zeros((0, 2)) if corner is None else corner.reshape(-1, 2).astype(np.float64)
+    for x, y in corners.round().astype(int):
         cv2.circle(room, (int(x), int(y)), round(distance), 0, -1)
     more: list[tuple[float, float]] = []
     for row, column in np.argwhere(room > 0):
-        if len(found) + len(more) >= wanted:
+        if len(corners) + len(more) >= wanted:
             break
         if room[row, column]:
             more.append((float(column), float(row)))
             cv2.circle(room, (int(column), int(row)), round(distance), 0, -1)
-    return np.concatenate([found, np.array(more).reshape(-1, 2)])
+    return np.concatenate([corners, np.array(more).reshape(-1, 2)])

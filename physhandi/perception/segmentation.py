@@ -239,21 +239,21 @@ def segment(
     check_places(sequence, clicks)
     if detected is None:
         detected = detected_keypoints(sequence, progress)
-    found: list[_Seen] = []
+    all_seen: list[_Seen] = []
     for view in colored:
         keypoint = detected.get(view.name, view.keypoint)
         if model is None and not view.has_depth:
             smaller = _SmallerView(view)
-            found.append(_Seen(smaller, sequence, smaller.shrunk(keypoint)))
+            all_seen.append(_Seen(smaller, sequence, smaller.shrunk(keypoint)))
         else:
-            found.append(_Seen(view, sequence, keypoint))
-    for seen in found:
-        seen.others = [other for other in found if other is not seen and other.view.has_depth]
-    _leave_out_wrong_hands(found)
-    _place_hands(sequence, found)
-    clicked = [seen for seen in found if any(click.view == seen.view.name for click in clicks)]
-    done, total = 0, len(found) * sequence.frame_count
-    for seen in [*clicked, *(seen for seen in found if seen not in clicked)]:
+            all_seen.append(_Seen(view, sequence, keypoint))
+    for seen in all_seen:
+        seen.others = [other for other in all_seen if other is not seen and other.view.has_depth]
+    _leave_out_wrong_hands(all_seen)
+    _place_hands(sequence, all_seen)
+    clicked = [seen for seen in all_seen if any(click.view == seen.view.name for click in clicks)]
+    done, total = 0, len(all_seen) * sequence.frame_count
+    for seen in [*clicked, *(seen for seen in all_seen if seen not in clicked)]:
         mine = [click for click in clicks if click.view == seen.view.name]
         starts = _clicked_starts(seen, mine) if mine else _borrowed_start(seen, clicked)
         if model is None:
@@ -269,7 +269,7 @@ def segment(
         whole.name: seen.view.enlarged(seen.label)
         if isinstance(seen.view, _SmallerView)
         else seen.label
-        for seen, whole in zip(found, colored, strict=True)
+        for seen, whole in zip(all_seen, colored, strict=True)
     }
 
 
@@ -299,10 +299,10 @@ def carry_on(
     progress = progress or NullProgress()
     views = [view for view in sequence.views if view.name in right]
     result: dict[str, ndarray] = {}
-    found = [_Seen(view, sequence, _keypoints(view, sequence, progress)) for view in views]
-    _leave_out_wrong_hands(found)
-    _place_hands(sequence, found)
-    for number, (view, seen) in enumerate(zip(views, found, strict=True)):
+    all_seen = [_Seen(view, sequence, _keypoints(view, sequence, progress)) for view in views]
+    _leave_out_wrong_hands(all_seen)
+    _place_hands(sequence, all_seen)
+    for number, (view, seen) in enumerate(zip(views, all_seen, strict=True)):
         seen.label[:] = masks[view.name]
         count, starts = view.frame_count, sorted(set(right[view.name]))
         ends = [(start, 0) for start in starts] + [(f, 1) for f in fixed.get(view.name, ())]
@@ -372,12 +372,12 @@ def detected_keypoints(
     sequence: Sequence, progress: Progress
 ) -> dict[str, Float[ndarray, "frame hand 21 3"]]:
     """Detect the hands of a sequence in views with color that have no keypoints, by their names."""
-    found = {
+    keypoints = {
         view.name: _keypoints(view, sequence, progress)
         for view in sequence.views
         if view.has_color and view.keypoint is None
     }
-    return {name: keypoint for name, keypoint in found.items() if keypoint is not None}
+    return {name: keypoint for name, keypoint in keypoints.items() if keypoint is not None}
 
 
 def _keypoints(
@@ -614,10 +614,10 @@ class _Start:
 def _clicked_starts(seen: _Seen, clicks: Many[Click]) -> dict[int, _Start]:
     starts: dict[int, _Start] = {}
     for click in clicks:
-        known = starts.get(click.frame)
-        image = known.image if known else _Image(seen.view, click.frame)
+        earlier = starts.get(click.frame)
+        image = earlier.image if earlier else _Image(seen.view, click.frame)
         seed = _around_click(seen, image, click)
-        seed = seed | known.seed if known else seed
+        seed = seed | earlier.seed if earlier else seed
         starts[click.frame] = _Start(image, seed, click)
     return starts
 
@@ -791,11 +791,11 @@ def _prompts(
     hands = {HAND_LABEL[side]: _hand_places(seen, HAND_LABEL[side]) for side in seen.hands}
     prompts: dict[int, list[Prompt]] = {}
     for frame, place in places.items():
-        others = [known[frame] for known in hands.values() if frame in known]
+        others = [own[frame] for own in hands.values() if frame in own]
         other = np.concatenate(others) if others else nothing
         prompts.setdefault(OBJECT_LABEL, []).append(Prompt(frame, place, other))
-    for value, known in hands.items():
-        shown = [Prompt(at, place, places.get(at, nothing)) for at, place in known.items()]
+    for value, own in hands.items():
+        shown = [Prompt(at, place, places.get(at, nothing)) for at, place in own.items()]
         if shown:
             prompts[value] = shown
     return prompts
@@ -803,7 +803,7 @@ def _prompts(
 
 def _hand_places(seen: _Seen, value: int) -> dict[int, Float[ndarray, "point 2"]]:
     """Find places on a hand in a few frames: of its palm, or as other views show it."""
-    found: dict[int, ndarray] = {}
+    places: dict[int, ndarray] = {}
     count = seen.view.frame_count
     if seen.keypoint is not None:
         hand = [HAND_LABEL[side] for side in seen.hands].index(value)
@@ -813,12 +813,12 @@ def _hand_places(seen: _Seen, value: int) -> dict[int, Float[ndarray, "point 2"]
             inside = (palm > -0.5) & (palm < np.array(seen.label.shape[:0:-1]) - 0.5)
             palm = palm[inside.all(axis=1)]
             if len(palm) >= _PLACES and frame - last >= _REMINDED:
-                found[frame], last = palm, frame
-    if not found:
+                places[frame], last = palm, frame
+    if not places:
         for frame in sorted({*range(0, count, max(1, count // 6))}):
             for _, core in _borrowed_cores(seen, frame, {value}):
-                found[frame] = _spread(core > 0)
-    return found
+                places[frame] = _spread(core > 0)
+    return places
 
 
 def _spread(mask: Bool[ndarray, "row column"]) -> Float[ndarray, "point 2"]:
@@ -868,13 +868,13 @@ def draw_hand(
         The picture; None if too few keypoints are known.
     """
     pixel = keypoint.astype(np.float64)
-    known = np.asarray(np.isfinite(pixel).all(axis=1))
-    if known.sum() < _LEAST_JOINTS:
+    is_seen = np.asarray(np.isfinite(pixel).all(axis=1))
+    if is_seen.sum() < _LEAST_JOINTS:
         return None
     core = np.zeros(shape, dtype=np.uint8)
-    at = np.clip(np.where(known[:, None], pixel, 0), -1e4, 1e4).round().astype(np.int32)
-    hull = at[[joint for joint in _PALM if known[joint]]]
-    if known[0] and known[9]:
+    at = np.clip(np.where(is_seen[:, None], pixel, 0), -1e4, 1e4).round().astype(np.int32)
+    hull = at[[joint for joint in _PALM if is_seen[joint]]]
+    if is_seen[0] and is_seen[9]:
         # Keypoint 0 is inside of the wrist; the hand goes on a little.
         beyond = np.clip(pixel[0] + 0.25 * (pixel[0] - pixel[9]), -1e4, 1e4)
         hull = np.concatenate([hull, beyond.round().astype(np.int32)[None]])
@@ -882,7 +882,7 @@ def draw_hand(
         cv2.fillConvexPoly(core, cv2.convexHull(hull), 1)
     width = max(1, round(0.16 * _palm_size(pixel)))
     for bone in _BONES:
-        line = at[[joint for joint in bone if known[joint]]]
+        line = at[[joint for joint in bone if is_seen[joint]]]
         if len(line) > 1:
             cv2.polylines(core, [line], isClosed=False, color=1, thickness=width)
     return core
@@ -954,23 +954,23 @@ def _hand_anchors(
     return anchors
 
 
-def _leave_out_wrong_hands(found: Many[_Seen]) -> None:
+def _leave_out_wrong_hands(all_seen: Many[_Seen]) -> None:
     """Drop keypoints that depth puts elsewhere than those of a view that is surer of its hand.
 
     A detector may take something for a hand that is none, the object's pattern for instance. The
     view is then shown the hand by the others, like one in which none was detected.
     """
-    known = [seen for seen in found if seen.keypoint is not None and seen.view.has_depth]
-    if len(known) < 2:
+    judged = [seen for seen in all_seen if seen.keypoint is not None and seen.view.has_depth]
+    if len(judged) < 2:
         return
-    keypoint = np.stack([np.asarray(seen.keypoint) for seen in known])
+    keypoint = np.stack([np.asarray(seen.keypoint) for seen in judged])
     # Over the whole recording: a wrong hand is found in few frames, but may be sure in some.
     trust = np.nan_to_num(keypoint[..., 2]).mean(axis=(1, 3))
     for frame, hand in np.ndindex(*keypoint.shape[1:3]):
         middle = np.stack(
             [
                 _middle_of_hand(seen, frame, keypoint[view, frame, hand])
-                for view, seen in enumerate(known)
+                for view, seen in enumerate(judged)
             ]
         )
         for view in np.argsort(trust[:, hand]):
@@ -978,8 +978,8 @@ def _leave_out_wrong_hands(found: Many[_Seen]) -> None:
             together = np.isfinite(middle[:, 0]) & ~apart
             if trust[apart, hand].sum() > trust[together, hand].sum():
                 keypoint[view, frame, hand] = middle[view] = np.nan
-    for seen, kept in zip(known, keypoint, strict=True):
-        seen.keypoint = kept
+    for seen, own in zip(judged, keypoint, strict=True):
+        seen.keypoint = own
 
 
 def _middle_of_hand(
@@ -998,24 +998,24 @@ def _middle_of_hand(
     return np.median(seen.view.camera.unproject(pixel, depth[depth > 0]), axis=0)
 
 
-def _place_hands(sequence: Sequence, found: Many[_Seen]) -> None:
+def _place_hands(sequence: Sequence, all_seen: Many[_Seen]) -> None:
     """Triangulate the keypoints of each hand, in the frames in which views agree about all."""
-    known = [(seen, seen.keypoint) for seen in found if seen.keypoint is not None]
-    cameras = [seen.view.camera for seen, _ in known]
-    if len(known) < 2:
+    pairs = [(seen, seen.keypoint) for seen in all_seen if seen.keypoint is not None]
+    cameras = [seen.view.camera for seen, _ in pairs]
+    if len(pairs) < 2:
         return
     for number, side in enumerate(sequence.hands):
-        keypoint = np.stack([part[:, number] for _, part in known]).astype(np.float64)
+        keypoint = np.stack([part[:, number] for _, part in pairs]).astype(np.float64)
         is_whole = np.isfinite(keypoint).all(axis=(2, 3))
         if not is_whole.any():
             continue
         pixel = keypoint[is_whole][..., :2]
         size = float(np.median(np.linalg.norm(np.ptp(pixel, axis=1), axis=1)))
-        flat = keypoint.reshape(len(known), -1, 3)
+        flat = keypoint.reshape(len(pairs), -1, 3)
         weight = np.nan_to_num(flat[..., 2])
         joint = triangulate(cameras, flat[..., :2], weight, _AGREEMENT * size).reshape(-1, 21, 3)
         joint[~np.isfinite(joint).all(axis=(1, 2))] = np.nan
-        for seen in found:
+        for seen in all_seen:
             seen.joint[HAND_LABEL[side]] = joint
 
 
@@ -1081,8 +1081,8 @@ def _height_scores(
     seen: _Seen, height: Float[ndarray, "row column"]
 ) -> tuple[Float[ndarray, "row column"], ...]:
     """Compute log-likelihoods of heights for background, object and hands."""
-    known = np.isfinite(height)
-    h = np.where(known, height, 0.0)
+    is_measured = np.isfinite(height)
+    h = np.where(is_measured, height, 0.0)
     sigma = 1.2 * seen.noise
     flat = np.exp(-0.5 * (h / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     above = 1 / (1 + np.exp(-np.clip(h / (0.7 * sigma), -30, 30)))
@@ -1090,7 +1090,7 @@ def _height_scores(
     background = (1 - seen.clutter) * flat + seen.clutter / _HIGHEST
     object_ = 0.5 * low / _LOW + (0.5 * above + 0.02) / _HIGHEST
     hand = 0.3 * low / _LOW + (above + 0.02) / _HIGHEST
-    return tuple(np.where(known, np.log(x), 0.0) for x in (background, object_, hand))
+    return tuple(np.where(is_measured, np.log(x), 0.0) for x in (background, object_, hand))
 
 
 def _judge(
@@ -1186,10 +1186,12 @@ def _begin(
         label = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
         if has_object:
             label = _hanging_together(seen, patch, label, seed)
-            kept = (label == OBJECT_LABEL) | seed
+            is_object = (label == OBJECT_LABEL) | seed
             # From a click, an object of several colors is found by what lies between them.
-            _learn_object(colors, shadowed, _off_rim(seen, patch, kept) if is_whole else kept)
-            farness = _farness(seen, patch, kept)
+            _learn_object(
+                colors, shadowed, _off_rim(seen, patch, is_object) if is_whole else is_object
+            )
+            farness = _farness(seen, patch, is_object)
         for value, hand in hands.items():
             seen.things[value].replace(patch.code[hand.core & (label == value)])
         _learn_background(seen, patch, shadowed, label)
@@ -1216,9 +1218,9 @@ def _learn_background(
     """Learn the colors of what is neither object nor hand, and how much of it is not support."""
     free = cv2.dilate(label, np.ones((3, 3), np.uint8)) == 0
     seen.background.replace(np.concatenate([code[free] for code in shadowed]))
-    known = free & np.isfinite(patch.height)
-    if known.sum() > 200:
-        off = np.abs(patch.height[known]) > 5 * seen.noise
+    is_measured = free & np.isfinite(patch.height)
+    if is_measured.sum() > 200:
+        off = np.abs(patch.height[is_measured]) > 5 * seen.noise
         seen.clutter = float(np.clip(off.mean(), 0.003, 0.3))
 
 
@@ -1343,7 +1345,7 @@ def _hanging_together(
     count = int(piece.max()) + 1
     size = np.bincount(piece[is_object], minlength=count)
     is_kept = np.bincount(piece[is_object & seed], minlength=count) > 0
-    kept = is_object & is_kept[piece]
+    stays = is_object & is_kept[piece]
     hand = label > OBJECT_LABEL
     owner = np.zeros(count, dtype=np.uint8)
     if is_kept.any() and hand.any():
@@ -1353,12 +1355,12 @@ def _hanging_together(
             seen, patch, label, piece, is_kept=is_kept, reach=max(1, round(reach))
         )
         if touches[is_kept].any():
-            least = max(_LEAST_PIECE, 0.02 * float(kept.sum()))
+            least = max(_LEAST_PIECE, 0.02 * float(stays.sum()))
             is_kept |= touches & (owner == _BACKGROUND) & (size >= least)
-            kept = is_object & is_kept[piece]
+            stays = is_object & is_kept[piece]
     # At depth edges single pixels are pieces of their own.
-    kept = is_object & (cv2.dilate(kept.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
-    return np.where(is_object & ~kept, owner[piece], label)
+    stays = is_object & (cv2.dilate(stays.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    return np.where(is_object & ~stays, owner[piece], label)
 
 
 def _beside_hands(

@@ -64,7 +64,7 @@ class ObjectShape:
     thickness: float
     """Median local thickness of what was seen; see `FoundClass` [m]."""
     reason: str
-    """What decided about the kind that was found, in one line."""
+    """Reason for the kind, in one line."""
     spacing: float
     """Distance between neighbouring nodes that was asked for [m]."""
     point_count: int
@@ -76,7 +76,7 @@ class ObjectShape:
 
     @property
     def warnings(self) -> list[dict[str, str]]:
-        """What a user should look at: ``code`` and ``message`` of each.
+        """Warnings for the user: ``code`` and ``message`` of each.
 
         A few points beside the object are no reason; masks are never exact.
         """
@@ -84,10 +84,10 @@ class ObjectShape:
         farthest = max((part.distance for part in self.removed), default=0.0)
         if count < _FEW * (count + self.point_count) and farthest < _FAR:
             return []
-        told = ", ".join(str(part) for part in self.removed)
+        texts = ", ".join(str(part) for part in self.removed)
         message = (
             f"{count} of {count + self.point_count} points that the masks of frame 0 call the "
-            f"object are not part of it and got no nodes: {told}."
+            f"object are not part of it and got no nodes: {texts}."
         )
         return [{"code": _WARNING_CODE, "message": message}]
 
@@ -184,14 +184,14 @@ def shape_of_nodes(node: Float[ndarray, "node 3"], sequence: Sequence) -> Object
     place = node.astype(np.float64)
     near = KDTree(place).query(place, k=min(2, len(place)))[0].reshape(len(place), -1)[:, -1]
     spacing = max(float(np.median(near)), _LEAST_SPACING)
-    found = find_class(place, spacing, ground_height=sequence.ground_height)
-    kind, reason = found.kind, found.reason
+    guess = find_class(place, spacing, ground_height=sequence.ground_height)
+    kind, reason = guess.kind, guess.reason
     if (sequence.surface_node_count or len(node)) < len(node):
         kind, reason = "solid", "it has nodes that are not on its surface"
     return ObjectShape(
         kind=sequence.shape or kind,
         is_given=sequence.shape is not None,
-        thickness=found.thickness,
+        thickness=guess.thickness,
         reason=reason,
         spacing=spacing,
         point_count=len(node),
@@ -232,12 +232,12 @@ def object_shape(
     seen = cloud.astype(np.float64)
     is_object, removed = object_points(seen, cell_size(seen, spacing), is_possible=is_possible)
     seen = seen[is_object]
-    found = find_class(seen, spacing, ground_height=ground_height, is_possible=is_possible)
+    guess = find_class(seen, spacing, ground_height=ground_height, is_possible=is_possible)
     samples = None if mesh is None else _samples(*mesh, spacing, ground_height)
     if samples is not None and mesh is not None and is_closed(mesh[1]):
-        found = _with_mesh(found, samples, spacing)
-    kind_used = kind or found.kind
-    thickness = found.thickness
+        guess = _with_mesh(guess, samples, spacing)
+    kind_used = kind or guess.kind
+    thickness = guess.thickness
     if ground_height is not None and kind_used in {"solid", "rope"}:
         thickness = min(thickness, float(np.percentile(seen[:, 2], 80)) - ground_height)
         is_ground = _is_ground(seen, cell_size(seen, spacing), ground_height, thickness)
@@ -258,8 +258,8 @@ def object_shape(
     return ObjectShape(
         kind=kind_used,
         is_given=kind is not None,
-        thickness=found.thickness,
-        reason=found.reason,
+        thickness=guess.thickness,
+        reason=guess.reason,
         spacing=spacing,
         point_count=len(seen),
         removed=removed,
@@ -308,10 +308,10 @@ def _samples(
     return samples
 
 
-def _with_mesh(found: FoundClass, mesh: SurfaceSamples, spacing: float) -> FoundClass:
+def _with_mesh(guess: FoundClass, mesh: SurfaceSamples, spacing: float) -> FoundClass:
     """Correct the kind of a body that was seen from one side only, which looks like a sheet."""
-    if found.kind != "sheet" or mesh.thickness < LEAST_LAYERS * spacing:
-        return found
+    if guess.kind != "sheet" or mesh.thickness < LEAST_LAYERS * spacing:
+        return guess
     reason = f"its mesh encloses a body that is {1e3 * mesh.thickness:.0f} mm thick on average"
     return FoundClass(kind="solid", thickness=mesh.thickness, reason=reason)
 

@@ -71,7 +71,7 @@ _FACING_SHARE = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class FoundClass:
-    """What kind of object a cloud shows, and how thick it is."""
+    """Kind and thickness of the object that a cloud shows."""
 
     kind: ShapeClass
     """Kind of object."""
@@ -79,7 +79,7 @@ class FoundClass:
     """Median local thickness [m]: height above the ground of a solid, distance between facing
     layers of a shell, width of a rope, spread of the cloud about the surface of a sheet."""
     reason: str
-    """What decided, in one line."""
+    """Reason for the kind, in one line."""
 
 
 def find_class(
@@ -140,12 +140,12 @@ def poisson_disk_points(
     """
     cloud = cloud[np.lexsort(cloud.T[::-1])]
     is_left = np.ones(len(cloud), dtype=bool)
-    kept: list[int] = []
+    chosen: list[int] = []
     for index, around in enumerate(KDTree(cloud).query_ball_point(cloud, distance)):
         if is_left[index]:
-            kept.append(index)
+            chosen.append(index)
             is_left[around] = False
-    point = cloud[kept]
+    point = cloud[chosen]
     for _ in range(rounds):
         owner = KDTree(point).query(cloud)[1]
         count = np.bincount(owner, minlength=len(point))
@@ -297,7 +297,7 @@ def _solid_of(
     near_ground = float(is_near_ground[counts].mean())
     if level > _LEVEL_SHARE or near_ground < _STANDING_SHARE:
         return None
-    told = f"{1e3 * height:.0f} mm high, and {100 * (1 - level):.0f} % of its outline falls off"
+    reason = f"{1e3 * height:.0f} mm high, and {100 * (1 - level):.0f} % of its outline falls off"
     if is_possible is not None:
         filled = [
             np.column_stack([np.repeat(one[None], len(levels), axis=0), levels])
@@ -312,8 +312,8 @@ def _solid_of(
             possible = float(is_possible(inside_point).mean())
             if possible < _POSSIBLE_SHARE:
                 return None
-            told += f"; views allow {100 * possible:.0f} % of what is below it"
-    return FoundClass(kind="solid", thickness=height, reason=told)
+            reason += f"; views allow {100 * possible:.0f} % of what is below it"
+    return FoundClass(kind="solid", thickness=height, reason=reason)
 
 
 def columns(
@@ -360,10 +360,10 @@ def _surface_of(
     rim = float(is_rim.sum()) * cell / (2.0 * np.sqrt(np.pi * area))
     share = len(gap) / max(len(patch), 1)
     layers = f"{100 * share:.0f} % of its points face another layer" if share else "in one layer"
-    told = f"{layers}, its rim is {rim:.1f} times as long as that of a disc"
+    reason = f"{layers}, its rim is {rim:.1f} times as long as that of a disc"
     if share >= _FACING_SHARE and rim < _SHORT_RIM:
-        return FoundClass(kind="shell", thickness=float(np.median(gap)), reason=told)
-    return FoundClass(kind="sheet", thickness=float(np.median(spread)), reason=told)
+        return FoundClass(kind="shell", thickness=float(np.median(gap)), reason=reason)
+    return FoundClass(kind="sheet", thickness=float(np.median(spread)), reason=reason)
 
 
 def _beside(

@@ -177,9 +177,9 @@ def thin_tracks(
     tracks: PixelTracks = {}
     for name, places in pixel.items():
         is_seen = np.asarray(np.isfinite(places).all(axis=-1))
-        kept = is_seen.sum(axis=0) >= min(SHORTEST_TRACK, frame_count)
-        if kept.any():
-            tracks[name] = places[:, kept], is_seen[:, kept]
+        is_long = is_seen.sum(axis=0) >= min(SHORTEST_TRACK, frame_count)
+        if is_long.any():
+            tracks[name] = places[:, is_long], is_seen[:, is_long]
     return tracks, "" if tracks else "no view shows it"
 
 
@@ -247,17 +247,17 @@ def _chains(seen: list[list[Float[ndarray, " 3"]]]) -> list[dict[int, Float[ndar
     """Join ends from frame to frame; the two that are seen most often, if often enough."""
     chains: list[dict[int, ndarray]] = []
     for frame, ends in enumerate(seen):
-        known = [(chain, list(chain.values())[-1]) for chain in chains]
+        heads = [(chain, list(chain.values())[-1]) for chain in chains]
         pair = sorted(
             (float(np.linalg.norm(end - last)), number, at)
             for number, end in enumerate(ends)
-            for at, (_, last) in enumerate(known)
+            for at, (_, last) in enumerate(heads)
         )
         taken: set[int] = set()
         joined: set[int] = set()
         for distance, number, at in pair:
             if distance <= _JUMP and number not in taken and at not in joined:
-                known[at][0][frame] = ends[number]
+                heads[at][0][frame] = ends[number]
                 taken.add(number)
                 joined.add(at)
         chains += [{frame: end} for number, end in enumerate(ends) if number not in taken]
@@ -290,7 +290,7 @@ def _measured(
     cell: Float[ndarray, " frame"],
 ) -> list[_Measured | None]:
     """Find in each frame the line that begins at an end."""
-    found: list[_Measured | None] = []
+    by_frame: list[_Measured | None] = []
     for frame, candidates in enumerate(lines):
         best: _Measured | None = None
         least = _NEAR_END * cell[frame]
@@ -304,8 +304,8 @@ def _measured(
             origin = float(line.arc_of(end[frame][None])[0])
             extent = origin if side else line.length - origin
             best = _Measured(line=line, origin=origin, sign=1 - 2 * side, extent=extent)
-        found.append(best)
-    return found
+        by_frame.append(best)
+    return by_frame
 
 
 def _trouble(
@@ -317,16 +317,16 @@ def _trouble(
     shown = int(is_shown.sum())
     plain = sum(bool(candidates) for candidates in lines)
     if plain < _MEASURED_FRAMES * shown:
-        told = "it branches, is closed, crosses or touches itself"
-        return f"it is a plain line in {plain} of {shown} frames: {told}"
+        why = "it branches, is closed, crosses or touches itself"
+        return f"it is a plain line in {plain} of {shown} frames: {why}"
     if not measured:
         return "neither of its ends is seen often enough"
     good = 0
     for frame, candidates in enumerate(lines):
         total = sum(line.length for line in candidates)
-        found = [one for chain in measured if (one := chain[frame]) is not None]
-        own = {id(one.line): one.line.length for one in found}
-        good += bool(found) and sum(own.values()) >= _MEASURED_SHARE * total
+        parts = [one for chain in measured if (one := chain[frame]) is not None]
+        own = {id(one.line): one.line.length for one in parts}
+        good += bool(parts) and sum(own.values()) >= _MEASURED_SHARE * total
     if good < _MEASURED_FRAMES * shown:
         return (
             f"half of it or more can be measured from an end that is seen in {good} of {shown} "
@@ -397,10 +397,10 @@ def _seen_pixels(
     pixel = np.full((len(place), 2), np.nan)
     if is_known.sum() < 2:
         return pixel
-    known = place[is_known]
-    middle = _on_middle(view.camera.project(known), is_object, _can_lift(depth, is_object))
+    points = place[is_known]
+    middle = _on_middle(view.camera.project(points), is_object, _can_lift(depth, is_object))
     there = pixel_values(solid_depth(depth, is_object), middle)
-    is_seen = (there > 0) & (np.abs(there - view.camera.camera_depth(known)) < _SURFACE)
+    is_seen = (there > 0) & (np.abs(there - view.camera.camera_depth(points)) < _SURFACE)
     pixel[is_known] = np.where(is_seen[:, None], middle, np.nan)
     return pixel
 

@@ -199,12 +199,12 @@ def _checkpoint(folder: Path, kind: str) -> Path:
     for place in places:
         if (place / first).is_file():
             return place / first
-    found = sorted(path for place in places for path in place.glob("*") if path.suffix in ends)
-    if len(found) != 1:
-        names = ", ".join(path.name for path in found)
-        there = f"several files of weights ({names})" if found else "no weights"
+    files = sorted(path for place in places for path in place.glob("*") if path.suffix in ends)
+    if len(files) != 1:
+        names = ", ".join(path.name for path in files)
+        there = f"several files of weights ({names})" if files else "no weights"
         raise UsageError(f"{folder}: has {there}; put {first} there, or one other file. {_REMEDY}")
-    return found[0]
+    return files[0]
 
 
 def _refuse_download(*_arguments: object, **_options: object) -> None:
@@ -291,10 +291,10 @@ def _tapnext(folder: Path, checkpoint: Path) -> Callable[..., _Paths]:
         for image in images:
             square = cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA)
             video = torch.from_numpy(square).float().to(device)[None, None] / 127.5 - 1
-            told = {"query_points": points} if state is None else {"state": state}
+            given = {"query_points": points} if state is None else {"state": state}
             with torch.no_grad():
-                found, _, logit, state = model(video=video, **told)
-            track.append(found[0, 0].float().cpu().numpy()[:, ::-1] / scale - 0.5)
+                moved, _, logit, state = model(video=video, **given)
+            track.append(moved[0, 0].float().cpu().numpy()[:, ::-1] / scale - 0.5)
             visible.append(logit[0, 0, :, 0].float().cpu().numpy() > 0)
         return np.stack(track), np.stack(visible)
 

@@ -41,7 +41,7 @@ _COLOR: Any = wp.vec4ub
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """What the centre of each pixel sees."""
+    """Nearest shape at the centre of each pixel."""
 
     depth: Float[ndarray, "row column"]
     """Distance along the camera's z axis [m]; 0 where nothing is."""

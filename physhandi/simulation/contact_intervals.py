@@ -42,9 +42,9 @@ class ContactIntervals:
 
     def within(self, radius: float, most: int) -> "ContactIntervals":
         """Keep the pairs that are `chosen`, in the order of virtual springs: by object node."""
-        kept = np.flatnonzero(self.chosen(radius, most))
-        order = np.lexsort((self.interval[kept, 0], self.control[kept], self.node[kept]))
-        return self._part(kept[order])
+        rows = np.flatnonzero(self.chosen(radius, most))
+        order = np.lexsort((self.interval[rows, 0], self.control[rows], self.node[rows]))
+        return self._part(rows[order])
 
     def spring_nodes(self, node_count: int) -> Int32[ndarray, "pair 2"]:
         """Give the two nodes of each pair: object node, and `node_count` + control."""
@@ -54,8 +54,8 @@ class ContactIntervals:
         """Keep the pairs of some control nodes, numbered anew in the order given."""
         place = np.full(int(max(self.control.max(initial=-1), np.max(numbers, initial=-1))) + 1, -1)
         place[numbers] = np.arange(len(numbers))
-        kept = self._part(np.flatnonzero(place[self.control] >= 0))
-        return replace(kept, control=place[kept.control].astype(np.int32))
+        part = self._part(np.flatnonzero(place[self.control] >= 0))
+        return replace(part, control=place[part.control].astype(np.int32))
 
     def _part(self, index: Int[ndarray, " part"]) -> "ContactIntervals":
         return ContactIntervals(**{f.name: getattr(self, f.name)[index] for f in fields(self)})

@@ -42,7 +42,7 @@ class Edit(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def title(self) -> str:
-        """What it does, as a list of steps says it: ``Cut 12 springs``."""
+        """Title in a list of steps: ``Cut 12 springs``."""
         raise NotImplementedError
 
     @property
@@ -69,7 +69,7 @@ class EditOfSprings(Edit, frozen=True, kw_only=True):
 
     @property
     def count_text(self) -> str:
-        """How many springs it names."""
+        """Number of its springs, in words."""
         return _counted(len(self.springs) + len(self.virtual), "spring")
 
 
@@ -77,13 +77,13 @@ class ScaleMaterial(EditOfSprings, frozen=True, kw_only=True, tag="scale"):
     """Makes springs stiffer or softer, or damps them more or less."""
 
     quantity: Literal["stiffness", "damping"]
-    """What is multiplied."""
+    """Quantity that is multiplied."""
     factor: Annotated[float, Meta(ge=1e-6, le=1e6)]
     """By how much."""
 
     @property
     def title(self) -> str:
-        """What it does, as a list of steps says it."""
+        """Title in a list of steps."""
         return f"{self.quantity.capitalize()} ×{self.factor:.3g} of {self.count_text}"
 
 
@@ -92,7 +92,7 @@ class Cut(EditOfSprings, frozen=True, kw_only=True, tag="cut"):
 
     @property
     def title(self) -> str:
-        """What it does, as a list of steps says it."""
+        """Title in a list of steps."""
         return f"Cut {self.count_text}"
 
 
@@ -107,7 +107,7 @@ class Join(Edit, frozen=True, kw_only=True, tag="join"):
 
     @property
     def title(self) -> str:
-        """What it does, as a list of steps says it."""
+        """Title in a list of steps."""
         return f"Join {_counted(len(self.springs), 'pair')} of nodes"
 
 
@@ -142,7 +142,7 @@ class Pin(EditOfNodes, frozen=True, kw_only=True, tag="pin"):
 
     @property
     def title(self) -> str:
-        """What it does, as a list of steps says it."""
+        """Title in a list of steps."""
         return self.said("Pin")
 
 
@@ -156,7 +156,7 @@ class Attach(EditOfNodes, frozen=True, kw_only=True, tag="attach"):
 
     @property
     def title(self) -> str:
-        """What it does, as a list of steps says it."""
+        """Title in a list of steps."""
         return self.said("Attach", " to the hand")
 
 
@@ -165,7 +165,7 @@ class Release(EditOfNodes, frozen=True, kw_only=True, tag="release"):
 
     @property
     def title(self) -> str:
-        """What it does, as a list of steps says it."""
+        """Title in a list of steps."""
         return self.said("Release")
 
 
@@ -452,13 +452,13 @@ def _with_springs(model: SpringMassModel, place: int, new: dict[str, ndarray]) -
 
 def _without(model: SpringMassModel, removed: Bool[ndarray, " spring"]) -> SpringMassModel:
     """Leave springs out."""
-    kept, own = ~removed, model.object_spring_count
+    stays, own = ~removed, model.object_spring_count
     return replace(
         model,
-        spring_nodes=model.spring_nodes[kept],
-        rest_length=model.rest_length[kept],
-        stiffness=model.stiffness[kept],
-        damping=model.damping[kept],
-        attached=model.attached[kept[own:]],
-        object_spring_count=int(kept[:own].sum()),
+        spring_nodes=model.spring_nodes[stays],
+        rest_length=model.rest_length[stays],
+        stiffness=model.stiffness[stays],
+        damping=model.damping[stays],
+        attached=model.attached[stays[own:]],
+        object_spring_count=int(stays[:own].sum()),
     )

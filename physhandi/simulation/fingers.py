@@ -171,16 +171,16 @@ class Fingers:
         """
         own = slice(4 * finger, 4 * finger + 4)
         low, high = (limit[own] for limit in self.limits(curl))
-        found = np.array(bend, np.float64)
-        found[own] = np.clip(found[own], low, high)
+        bent = np.array(bend, np.float64)
+        bent[own] = np.clip(bent[own], low, high)
         tip = curled(self.tip, curl)[finger]
         size = float(np.sum((tip - curled(self.origin, curl)[3 * finger]) ** 2))
         damping = 1e-3
-        missing, jacobian = self._aim(finger, tip, target, curl, found)
+        missing, jacobian = self._aim(finger, tip, target, curl, bent)
         for _ in range(_MOST_STEPS):
             if missing @ missing < _THERE**2 * size:
                 break
-            now = found[own].copy()
+            now = bent[own].copy()
             wish = jacobian.T @ missing
             is_free = ~(((now <= low) & (wish < 0.0)) | ((now >= high) & (wish > 0.0)))
             part = jacobian[:, is_free]
@@ -188,18 +188,18 @@ class Fingers:
             step = np.zeros(4)
             step[is_free] = np.linalg.solve(damped, wish[is_free])
             step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), _STILL))
-            found[own] = np.clip(now + step, low, high)
-            turned = float(np.abs(found[own] - now).max())
-            then = self._aim(finger, tip, target, curl, found)
+            bent[own] = np.clip(now + step, low, high)
+            turned = float(np.abs(bent[own] - now).max())
+            then = self._aim(finger, tip, target, curl, bent)
             if then[0] @ then[0] < missing @ missing:
                 missing, jacobian = then
                 damping = max(0.3 * damping, _LEAST_DAMPING)
             else:
-                found[own] = now
+                bent[own] = now
                 damping *= 4.0
             if turned < _STILL or damping > _MOST_DAMPING:
                 break
-        return found
+        return bent
 
     def _aim(
         self,

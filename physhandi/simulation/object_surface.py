@@ -55,7 +55,7 @@ class ObjectSurface:
     tube: "Tube | None" = None
     """How the vertices of a rope stand round its middle; None where there are no rings."""
     color: UInt8[ndarray, "vertex 3"] | None = None
-    """What the object looks like; None if nothing has seen it."""
+    """Color of each vertex; None if no view has seen it."""
 
     @property
     def node_count(self) -> int:

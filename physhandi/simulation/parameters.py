@@ -29,7 +29,7 @@ Stiffness = Annotated[float, Meta(ge=0.0, le=1e8)]
 Coordinate = Annotated[float, Meta(ge=-1e5, le=1e5)]
 
 Effect = Literal["live", "material", "topology", "step", "world"]
-"""What has to be done for a new value: ``live`` is assigned to the device at once; ``material``
+"""Work that a new value needs: ``live`` is assigned to the device at once; ``material``
 scales the fitted springs; ``topology`` lays the springs anew; ``step`` needs another simulator;
 ``world`` only decides what `SimulationParameters.in_world` takes from a recording."""
 
@@ -44,7 +44,7 @@ class Slider:
     group: SliderGroup
     """Folder in which it is."""
     hint: str
-    """What it does, in a sentence for the panel."""
+    """Effect of the parameter, in a sentence for the panel."""
     widest: float | None = None
     """End of the slider, in the parameter's unit; a larger fitted value moves it. None takes the
     parameter's own upper bound."""
@@ -56,12 +56,12 @@ class Slider:
 
 @dataclass(frozen=True, kw_only=True)
 class Role:
-    """What a parameter does in the simulation, and how people meet it."""
+    """Role of a parameter in the simulation and in user interfaces."""
 
     effect: Effect = "live"
-    """What has to be done for a new value."""
+    """Work that a new value needs."""
     label: str = ""
-    """What people call it; empty for its own name."""
+    """Name for people; empty for the parameter's own name."""
     slider: Slider | None = None
     """How people move it live; None where they do not."""
     is_length: bool = False
@@ -80,7 +80,7 @@ class Parameter(Field, Role):
 
     @property
     def title(self) -> str:
-        """What people call it."""
+        """Name for people."""
         return self.label or self.name
 
 

@@ -27,7 +27,7 @@ from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.stability import explain_divergence
 
 NO_DIVERGENCE = np.iinfo(np.int32).max
-"""What `Simulator.first_divergence` holds as long as no node has diverged."""
+"""Value of `Simulator.first_divergence` as long as no node has diverged."""
 _WORLD: Any = World
 
 
@@ -287,7 +287,7 @@ class Simulator:
 
     @cached_property
     def rod(self) -> RodForce | None:
-        """What bends the object, if it is a rope; built on first use."""
+        """Bending forces of the object, if it is a rope; built on first use."""
         return None if self.model.rod is None else RodForce(self.model, self.device)
 
     @property

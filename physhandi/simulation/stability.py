@@ -305,8 +305,8 @@ def _stiffest_mode(springs: _SpringOperator, step: float, start: ndarray) -> nda
         basis.append(force / rest)
     last = len(diagonal) - 1
     chosen = {"select": "i", "select_range": (last, last)}
-    found: Any = eigh_tridiagonal(diagonal, beside[:last], **chosen)
-    part = found[1]
+    solution: Any = eigh_tridiagonal(diagonal, beside[:last], **chosen)
+    part = solution[1]
     mode = np.zeros(len(start))
     for index in range(last + 1):
         mode += part[index, 0] * basis[index]

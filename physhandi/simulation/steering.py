@@ -95,7 +95,7 @@ class SteeredHand:
     """Control nodes that move with a wrist, and with the fingers of a hand that has bones."""
 
     name: str
-    """What it is called: ``right``, ``left``, or ``controls`` where there are no hands."""
+    """Name: ``right``, ``left``, or ``controls`` where there are no hands."""
     control: Int[ndarray, " own"]
     """Numbers of its control nodes."""
     wrist: Float[ndarray, " 3"]
@@ -204,7 +204,7 @@ class SteeredMotion:
     start: NodeState
     """Positions and velocities of the nodes in the first frame [m, m/s]."""
     parameters: SimulationParameters
-    """What it is simulated with."""
+    """Simulation parameters."""
     control: Float32[ndarray, "control 3"]
     """Control nodes where all poses are zero [m]."""
     hands: tuple[SteeredHand, ...]
@@ -386,15 +386,17 @@ class SteeredMotion:
         """Begin another motion, in which a point is held no more; the arguments are `let_go`'s."""
         free = self.let_go(hand, state, pose)
         gone, model = self.hands[hand].control, free.model
-        kept = np.setdiff1d(np.arange(model.control_count), gone)
+        remaining = np.setdiff1d(np.arange(model.control_count), gone)
         place = np.zeros(model.node_count + model.control_count, np.int32)
         place[: model.node_count] = np.arange(model.node_count)
-        place[model.node_count + kept] = model.node_count + np.arange(len(kept))
+        place[model.node_count + remaining] = model.node_count + np.arange(len(remaining))
         others = [number for number in range(len(self.hands)) if number != hand]
         return replace(
             free,
-            model=replace(model, spring_nodes=place[model.spring_nodes], control_count=len(kept)),
-            control=self.control[kept],
+            model=replace(
+                model, spring_nodes=place[model.spring_nodes], control_count=len(remaining)
+            ),
+            control=self.control[remaining],
             hands=tuple(
                 replace(its, control=place[model.node_count + its.control] - model.node_count)
                 for its in (self.hands[number] for number in others)
@@ -410,7 +412,7 @@ class SteeredMotion:
 
     def _rejoined(
         self,
-        kept: Bool[ndarray, " spring"],
+        stays: Bool[ndarray, " spring"],
         state: NodeState,
         pose: Float[ndarray, "hand pose"],
         joined: tuple[Int[ndarray, "new 2"], Float[ndarray, " new"]] | None = None,
@@ -418,7 +420,7 @@ class SteeredMotion:
         """Begin another motion with other virtual springs, and with more substeps if they need it.
 
         Args:
-            kept: Springs that stay.
+            stays: Springs that stay.
             state: Where the object is then, and how fast [m, m/s].
             pose: Poses of the hands then.
             joined: Nodes and lengths of new virtual springs [m].
@@ -427,17 +429,17 @@ class SteeredMotion:
         ends, length = (np.zeros((0, 2), np.int32), np.zeros(0)) if joined is None else joined
 
         def spread(old: ndarray, new: ndarray | float) -> ndarray:
-            return np.concatenate([old[kept], np.broadcast_to(new, len(ends)).astype(old.dtype)])
+            return np.concatenate([old[stays], np.broadcast_to(new, len(ends)).astype(old.dtype)])
 
         damping = parameters.damping if parameters.virtual_stiffness > 0.0 else 0.0
         model = replace(
             model,
-            spring_nodes=np.concatenate([model.spring_nodes[kept], ends]).astype(np.int32),
+            spring_nodes=np.concatenate([model.spring_nodes[stays], ends]).astype(np.int32),
             rest_length=spread(model.rest_length, np.maximum(length, virtual_floor(parameters))),
             stiffness=spread(model.stiffness, parameters.virtual_stiffness),
             damping=spread(model.damping, damping),
             attached=np.concatenate(
-                [model.attached[kept[model.object_spring_count :]], always(len(ends))]
+                [model.attached[stays[model.object_spring_count :]], always(len(ends))]
             ),
         )
         taken = replace(

@@ -181,9 +181,9 @@ class _Patch:
         return across / max(float(np.linalg.norm(across)), 1e-300)
 
 
-def _lies_beside(found: list[ndarray], side: Float[ndarray, " 3"]) -> bool:
+def _lies_beside(sides: list[ndarray], side: Float[ndarray, " 3"]) -> bool:
     """Whether two triangles lie on different sides of their common edge."""
-    return all(float(other @ side) < _OVERLAP for other in found)
+    return all(float(other @ side) < _OVERLAP for other in sides)
 
 
 def _tangent_triangles(

@@ -24,7 +24,7 @@ from waiting import LIMIT_S, until
 from app.previews import store, worker
 from app.previews.camera import fitting_camera
 from app.previews.clip import clip_of_run, clip_of_sequence
-from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
+from app.previews.draw import HEIGHT, WIDTH, PreviewMotion, draw_motion
 from app.previews.store import Previews
 from app.settings import BUNDLED
 from physhandi.child import PACKAGE_ROOT, ChildEndedError
@@ -61,7 +61,7 @@ def test_a_camera_fills_the_picture_from_above_and_in_front() -> None:
 
 def test_a_point_is_drawn_where_the_camera_sees_it_on_a_clear_ground() -> None:
     moved = np.stack([SQUARE, SQUARE + np.array([0.0, 0.0, 0.5])])
-    first, second = draw_motion(Motion(marker=moved), [0, 1])
+    first, second = draw_motion(PreviewMotion(marker=moved), [0, 1])
     assert first.shape == (HEIGHT, WIDTH, 4)
     assert (first[..., 3] == 0).mean() > 0.9
     camera: PinholeCamera = fitting_camera(moved.reshape(-1, 3), WIDTH, HEIGHT)
@@ -80,7 +80,7 @@ def test_the_surface_of_an_object_is_drawn_in_its_own_colors_in_place_of_its_nod
     surface = lay_surface(node, kind="sheet")
     red = np.tile(np.array([220, 20, 20], np.uint8), (surface.vertex_count, 1))
     pairs = np.stack([np.arange(63), np.arange(1, 64)], axis=1)
-    motion = Motion(node=node[None], spring=pairs, surface=replace(surface, color=red))
+    motion = PreviewMotion(node=node[None], spring=pairs, surface=replace(surface, color=red))
     picture = draw_motion(motion, [0])[0]
     covered = int((picture[..., 3] > 200).sum())
     assert len(colored(picture, 0)) > 0.98 * covered > 10_000
@@ -93,7 +93,7 @@ def test_a_surface_hides_what_lies_behind_it_and_not_what_lies_before() -> None:
     spots = {"before": [0.2, -0.5, 0.0], "behind": [-0.2, 0.5, 0.0]}
     counts = {}
     for name, spot in spots.items():
-        motion = Motion(hands=((wall, face),), control=np.array([[spot]]))
+        motion = PreviewMotion(hands=((wall, face),), control=np.array([[spot]]))
         counts[name] = len(colored(draw_motion(motion, [0])[0], 0))
     assert counts["behind"] == 0
     assert counts["before"] > 20
@@ -101,7 +101,7 @@ def test_a_surface_hides_what_lies_behind_it_and_not_what_lies_before() -> None:
 
 def test_nothing_finite_is_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
-        draw_motion(Motion(marker=np.full((2, 3, 3), np.nan)), [0])
+        draw_motion(PreviewMotion(marker=np.full((2, 3, 3), np.nan)), [0])
 
 
 def test_clips_keep_the_pace_and_show_video_points_or_what_was_fitted(world: World) -> None:

@@ -10,7 +10,7 @@ from suite_world import order_of, table, write_told
 from waiting import until
 
 from app.cli.lookup import read_settings
-from app.cli.suite_jobs import WORKER, SuiteJobs
+from app.cli.suite_jobs import SUITE_WORKER, SuiteJobs
 from app.jobs.catalog import Catalog
 from app.jobs.engines.cluster import Cluster, ClusterError, Demand
 from app.jobs.engines.following import FollowedRun, follow_to_end
@@ -160,7 +160,7 @@ def test_a_command_follows_a_fit_and_ctrl_c_returns_when_nothing_is_left(
 def test_cells_of_a_suite_are_jobs(told: str, tmp_path: Path) -> None:
     recording = write_told(tmp_path / "low", 0.12)
     out = tmp_path / "suite"
-    engine = reached_cluster(read_settings(engine=told), WORKER)
+    engine = reached_cluster(read_settings(engine=told), SUITE_WORKER)
     jobs = SuiteJobs(engine, out, Progress(), most=2, grace_s=0.3)
     order = order_of(
         (recording,),

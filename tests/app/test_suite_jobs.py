@@ -13,7 +13,7 @@ from suite_world import order_of, table, write_told
 from waiting import until
 
 from app.cli.lookup import read_settings
-from app.cli.suite_jobs import WORKER, SuiteJobs
+from app.cli.suite_jobs import SUITE_WORKER, SuiteJobs
 from app.jobs.engines import ray_engine
 from app.jobs.engines.ray_engine import RayEngine
 from app.jobs.processes import marked_processes
@@ -53,7 +53,7 @@ class Deed(Progress):
 
 
 def jobs_of(cluster: MadeCluster, out: Path, progress: Progress) -> SuiteJobs:
-    engine = RayEngine.of(read_settings(engine=cluster.address), WORKER)
+    engine = RayEngine.of(read_settings(engine=cluster.address), SUITE_WORKER)
     engine.refresh()
     return SuiteJobs(engine, out, progress, most=2, grace_s=0.3)
 

@@ -14,7 +14,7 @@ from old_data import SAME_MOTION_M, OldFolder, command, differences, serve, unpa
 from server_world import World
 from starlette.testclient import TestClient
 
-from app.viewer.content.content import open_run, open_sequence
+from app.viewer.content.content import open_run_content, open_sequence_content
 from app.viewer.physics.presets import PresetStore
 from physhandi.run import Run
 
@@ -146,14 +146,14 @@ def test_a_suite_is_listed_with_its_figures(old: OldFolder, world: World) -> Non
 
 def test_scenes_open_with_the_stored_motion(old: OldFolder, world: World) -> None:
     for name in PUBLISHED:
-        content = open_run(world.catalog, old.run(name).name)
+        content = open_run_content(world.catalog, old.run(name).name)
         folder = f"sequences/{sequence_of(old, name)}"
         assert content.fitted is not None
         assert np.array_equal(content.fitted.position, stored(old, name, f"{folder}/rollout.npy"))
         assert np.array_equal(content.fitted.control, stored(old, name, f"{folder}/control.npy"))
         assert content.tracks is not None
         content.close()
-    content = open_run(world.catalog, old.ids["grasp"])
+    content = open_run_content(world.catalog, old.ids["grasp"])
     vertex = stored(old, "grasp", "sequences/grasp/hand_right_vertex.npy")
     face = stored(old, "grasp", "sequences/grasp/hand_right_face.npy")
     assert [hand.side for hand in content.hands] == ["right"]
@@ -165,7 +165,7 @@ def test_scenes_open_with_the_stored_motion(old: OldFolder, world: World) -> Non
     assert [view.name for view in content.views] == ["front", "side"]
     assert content.views[0].color(1).shape == (64, 64, 3)
     content.close()
-    with_views = open_sequence(world.catalog, "grasp")
+    with_views = open_sequence_content(world.catalog, "grasp")
     assert len(with_views.skeletons) == 1
     with_views.close()
 
@@ -307,7 +307,7 @@ def test_a_folder_from_another_machine_opens_where_it_is(tmp_path: Path, old: Ol
     data = unpack(tmp_path)
     client = serve(data).script()
     assert len(get(client, "/api/v1/runs")["runs"]) == len(old.expected["runs"]) + 1
-    content = open_run(serve(data).catalog, old.ids["grasp"])
+    content = open_run_content(serve(data).catalog, old.ids["grasp"])
     assert content.fitted is not None
     assert content.views, "the recording is found by its name"
     content.close()

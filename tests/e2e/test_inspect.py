@@ -12,7 +12,7 @@ from scene_page import ScenePage
 from viewer_world import FolderCatalog
 
 from app.benchmarks.splats import scattered
-from app.viewer.content.content import open_run
+from app.viewer.content.content import open_run_content
 from app.viewer.scene.framing import frame_content
 from physhandi.data.layout import SPLATS_FILE
 from physhandi.run import Run
@@ -30,7 +30,7 @@ BELOW = (0, 80, 94)
 
 def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
     """Where a point of the scene is seen, with the camera where it stands at first."""
-    framing = frame_content(open_run(FolderCatalog(BUNDLED), "towel_fold_quick"))
+    framing = frame_content(open_run_content(FolderCatalog(BUNDLED), "towel_fold_quick"))
     ahead = framing.look_at - framing.camera
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -186,7 +186,7 @@ def seen_as(scene: ScenePage, color: tuple[int, int, int]) -> int:
 @pytest.fixture(scope="module")
 def seen(served) -> Run:
     """The bundled run as one whose object has purple splats."""
-    content = open_run(FolderCatalog(BUNDLED), "towel_fold_quick")
+    content = open_run_content(FolderCatalog(BUNDLED), "towel_fold_quick")
     surface, fitted = content.surface, content.fitted
     assert surface is not None
     assert fitted is not None

@@ -39,7 +39,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         config={"profile": load_profile("quick").to_dict()},
     )
     with run.begin_attempt() as attempt:
-        pipeline.reconstruct([sequence], SMALL, attempt, attempt.progress())
+        pipeline.run_reconstruction([sequence], SMALL, attempt, attempt.progress())
         attempt.publish()
     return folder
 

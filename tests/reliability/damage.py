@@ -25,7 +25,7 @@ from app.jobs.processes import end_processes
 from app.jobs.recovery.left_behind import find_left_behind, tidy
 from app.jobs.recovery.recovery import damaged_folders
 from app.settings import ServerSettings
-from app.viewer.content.content import open_run
+from app.viewer.content.content import open_run_content
 from physhandi.data.sequence import Sequence
 from physhandi.errors import PhysHandiError
 from physhandi.run import Run
@@ -101,7 +101,7 @@ def _ask_for_all(world: World, damaged: dict[str, list[str]], counts: Counter[st
             counts["wrong"] += client.get(address).status_code >= 500
     for run_id in damaged["run_id"]:
         try:
-            open_run(world.catalog, run_id).close()
+            open_run_content(world.catalog, run_id).close()
         except (PhysHandiError, OSError):
             continue  # It says which file is damaged.
 

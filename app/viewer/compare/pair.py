@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from app.comparison import CompareAsk
 from app.viewer.compare.curve import Pairing
-from app.viewer.content.content import Catalog, Content, open_run
+from app.viewer.content.content import Content, ContentSource, open_run_content
 from physhandi.data.layout import SequenceFiles
 from physhandi.errors import UsageError
 from physhandi.run import Run
@@ -91,7 +91,7 @@ class Pair:
         return f"{first.title} and {second.title}"
 
 
-def open_pair(catalog: Catalog, ask: CompareAsk) -> Pair:
+def open_pair(catalog: ContentSource, ask: CompareAsk) -> Pair:
     """Open both runs at a sequence that they share, if there is one.
 
     Args:
@@ -104,7 +104,10 @@ def open_pair(catalog: Catalog, ask: CompareAsk) -> Pair:
     """
     first, second = catalog.run(ask.a), catalog.run(ask.b)
     names = chosen_sequences(first, second, ask.sequence)
-    contents = (open_run(catalog, ask.a, names[0]), open_run(catalog, ask.b, names[1]))
+    contents = (
+        open_run_content(catalog, ask.a, names[0]),
+        open_run_content(catalog, ask.b, names[1]),
+    )
     clock = CompareClock.of(*contents)
     notes: list[str] = []
     if names[0] != names[1]:

@@ -19,7 +19,7 @@ from app.viewer.compare.drawing import (
     difference_scale,
 )
 from app.viewer.compare.sides import SIDE_KEYS
-from app.viewer.ui.guard import Guard, plain
+from app.viewer.ui.guard import Guard, without_markup
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.plot import FramePlot, PlotCurve, rounded_up
 
@@ -112,7 +112,7 @@ class ComparePanel:
         """Name A and B.
 
         Args:
-            names: Name of each side; of a user's text only what `plain` leaves of it.
+            names: Name of each side; of a user's text only what `without_markup` leaves of it.
             notes: What a user should know of the pair, as sentences.
             unit: Unit of lengths.
             tick_count: Number of ticks of the clock.
@@ -203,12 +203,12 @@ class ComparePanel:
                 f"{v * self._factor:.3g}" for v in (difference.mean, difference.largest)
             )
             lines.append(
-                f"{_mark(_MEAN)} mean {mean} {plain(self._unit)} "
-                f"{_mark(_LARGEST)} max {largest} {plain(self._unit)} between A and B"
+                f"{_mark(_MEAN)} mean {mean} {without_markup(self._unit)} "
+                f"{_mark(_LARGEST)} max {largest} {without_markup(self._unit)} between A and B"
             )
         elif way is not None:
             lines.append("measuring the difference …")
-        lines += [plain(_COMPARED[way])] if way else []
+        lines += [without_markup(_COMPARED[way])] if way else []
         return lines + [f"<em>{escape(note)}</em>" for note in self._notes]
 
     @staticmethod

@@ -15,7 +15,7 @@ from app.viewer.compare.drawing import Look
 from app.viewer.compare.pair import open_pair, pairing_of
 from app.viewer.compare.sides import SIDE_KEYS, ComparedSide, Sides, compared_rollouts
 from app.viewer.compare.view import CompareView
-from app.viewer.content.content import Catalog, Content
+from app.viewer.content.content import Content, ContentSource
 from app.viewer.content.layers import Layers, default_layers
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.export.export_panel import ExportPanel
@@ -23,7 +23,7 @@ from app.viewer.export.snapshot import Snapshot
 from app.viewer.scene.framing import Framing, frame_content
 from app.viewer.scene.layers_panel import LayersPanel, set_theme
 from app.viewer.scene.scene_server import SceneServer
-from app.viewer.ui.guard import plain
+from app.viewer.ui.guard import without_markup
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
 
@@ -39,7 +39,7 @@ class CompareSession(SceneServer):
         *,
         target: str,
         owner: str,
-        catalog: Catalog,
+        catalog: ContentSource,
         state: SessionState | None = None,
     ) -> None:
         """Open both runs; raises the catalog's errors before a server is started.
@@ -168,7 +168,9 @@ class CompareSession(SceneServer):
         bind(server, guard, "color_back", lambda _, __: self._view.panel.next_tint(-1))
         bind(server, guard, "reset", lambda event, _: self._reset_view(event))
         bind(server, guard, "snapshot", lambda event, _: export.save("PNG", event.client))
-        names = {side: plain(c.title) for side, c in zip(SIDE_KEYS, pair.contents, strict=True)}
+        names = {
+            side: without_markup(c.title) for side, c in zip(SIDE_KEYS, pair.contents, strict=True)
+        }
         unit = pair.contents[0].length_unit
         self._view.panel.name(names, pair.notes, unit=unit, tick_count=pair.clock.tick_count)
         self._view.follow(pairing_of(pair))

@@ -33,7 +33,7 @@ from physhandi.simulation.object_surface import ObjectSurface
 logger = logging.getLogger(__name__)
 
 
-class Catalog(Protocol):
+class ContentSource(Protocol):
     """Finds runs and sequences by their ids."""
 
     def run(self, run_id: str, /) -> Run:
@@ -122,7 +122,9 @@ class Content:
             view.close()
 
 
-def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) -> Content:
+def open_run_content(
+    catalog: ContentSource, run_id: str, sequence_name: str | None = None
+) -> Content:
     """Collect the results of one of a run's sequences.
 
     Args:
@@ -172,7 +174,7 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
     )
 
 
-def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
+def open_sequence_content(catalog: ContentSource, sequence_id: str) -> Content:
     """Collect what a recording shows before anything is fitted to it."""
     sequence = catalog.sequence(sequence_id)
     return Content(
@@ -213,7 +215,7 @@ def _mass(run: Run, meta: RecordingFile, sequence: Sequence | None) -> ObjectMas
     return estimated_mass(run.yaml(SHAPE_FILE)) if run.has(SHAPE_FILE) else None
 
 
-def _recording(catalog: Catalog, run: Run, name: str) -> Sequence | None:
+def _recording(catalog: ContentSource, run: Run, name: str) -> Sequence | None:
     """Find the recording where the run found it, else by its name."""
     folder = Path(run.sequences[run.sequence_names.index(name)])
     try:

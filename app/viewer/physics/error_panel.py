@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.content.content import Content
-from app.viewer.ui.guard import plain
+from app.viewer.ui.guard import without_markup
 from app.viewer.ui.plot import FramePlot, PlotCurve
 from physhandi.data.files import named_fields
 from physhandi.data.layout import SequenceFiles
@@ -93,7 +93,9 @@ class ErrorPanel:
         self._folder = server.gui.add_folder("Error per frame")
         with self._folder:
             if warnings:
-                texts = ", ".join(plain(code.replace("_", " ")) for code in dict.fromkeys(warnings))
+                texts = ", ".join(
+                    without_markup(code.replace("_", " ")) for code in dict.fromkeys(warnings)
+                )
                 server.gui.add_html(
                     f'<div style="{_STYLE}"><b>Warnings</b> of the fit: {texts} '
                     "(see its page)</div>"
@@ -164,7 +166,7 @@ class ErrorPanel:
         if not np.isfinite(error):
             return ""
         dot = f'<span style="color:{color}">●</span>'
-        return f"{dot} {what} {error * self._per_unit:.3g} {plain(self._unit)} {other}"
+        return f"{dot} {what} {error * self._per_unit:.3g} {without_markup(self._unit)} {other}"
 
     def _curves(self) -> list[Float[ndarray, " frame"]]:
         """Collect the curves, as far as the rollout is simulated."""

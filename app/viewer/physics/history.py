@@ -9,7 +9,7 @@ MOST_STEPS = 50
 """Steps that are kept; the oldest go first. `History.reset` needs none of them."""
 
 
-class Setting(NamedTuple):
+class TriedSetting(NamedTuple):
     """What is simulated."""
 
     parameters: SimulationParameters
@@ -37,7 +37,7 @@ class History:
             edits: Those of the fitted object, likewise.
         """
         self.start = start
-        self.begin = self.setting = Setting(start, edits=edits)
+        self.begin = self.setting = TriedSetting(start, edits=edits)
         """What is in force; it was `begin` at first."""
         self._steps = [self.setting]
         self._index = 0
@@ -56,7 +56,7 @@ class History:
         return self.setting.is_automatic
 
     @property
-    def steps(self) -> tuple[Setting, ...]:
+    def steps(self) -> tuple[TriedSetting, ...]:
         """All settings that can be returned to, in the order in which they were tried."""
         return tuple(self._steps)
 
@@ -65,7 +65,7 @@ class History:
         """Which of the steps is in force."""
         return self._index
 
-    def set(self, field: str, value: Any, *, gesture: int = 0) -> Setting:
+    def set(self, field: str, value: Any, *, gesture: int = 0) -> TriedSetting:
         """Change one parameter, as a control does that is being moved.
 
         Args:
@@ -78,46 +78,48 @@ class History:
             changed = changed._replace(is_automatic=False)
         return self._put(changed, (field, gesture))
 
-    def replace(self, parameters: SimulationParameters, *, is_automatic: bool = False) -> Setting:
+    def replace(
+        self, parameters: SimulationParameters, *, is_automatic: bool = False
+    ) -> TriedSetting:
         """Change all parameters at once; edits stay."""
-        return self._put(Setting(parameters, is_automatic, self.setting.edits), None)
+        return self._put(TriedSetting(parameters, is_automatic, self.setting.edits), None)
 
-    def edit(self, edits: Edits) -> Setting:
+    def edit(self, edits: Edits) -> TriedSetting:
         """Change what is done to single springs and nodes; this is a step of its own."""
         return self._put(self.setting._replace(edits=edits), None)
 
-    def choose_substeps(self, *, is_automatic: bool) -> Setting:
+    def choose_substeps(self, *, is_automatic: bool) -> TriedSetting:
         """Have the number of substeps chosen automatically, or take the fitted one."""
         number = self.start.substeps_per_frame
         changed = self.current.replace(substeps_per_frame=number)
         return self.replace(changed, is_automatic=is_automatic)
 
-    def put_back(self, *fields: str) -> Setting:
+    def put_back(self, *fields: str) -> TriedSetting:
         """Give some parameters their fitted values again."""
         fitted = {field: getattr(self.start, field) for field in fields}
         is_automatic = self.is_automatic and "substeps_per_frame" not in fields
         return self.replace(self.current.replace(**fitted), is_automatic=is_automatic)
 
-    def undo(self) -> Setting:
+    def undo(self) -> TriedSetting:
         """Take the last change back."""
         return self.go(self._index - 1)
 
-    def redo(self) -> Setting:
+    def redo(self) -> TriedSetting:
         """Make the change again that was taken back last."""
         return self.go(self._index + 1)
 
-    def go(self, index: int) -> Setting:
+    def go(self, index: int) -> TriedSetting:
         """Return to one of the `steps`, the nearest if there is none of that index."""
         self._gesture = None
         self._index = min(max(index, 0), len(self._steps) - 1)
         self.setting = self._steps[self._index]
         return self.setting
 
-    def reset(self) -> Setting:
+    def reset(self) -> TriedSetting:
         """Return to the fitted parameters and edits; this can be undone."""
         return self._put(self.begin, None)
 
-    def _put(self, setting: Setting, gesture: tuple[str, int] | None) -> Setting:
+    def _put(self, setting: TriedSetting, gesture: tuple[str, int] | None) -> TriedSetting:
         """Bring a setting into force; what a gesture has set before gives way to it."""
         if setting == self.setting:
             return setting

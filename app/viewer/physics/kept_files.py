@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
-from app.viewer.ui.guard import plain
+from app.viewer.ui.guard import without_markup
 from physhandi.errors import PhysHandiError, UsageError, describe
 
 logger = logging.getLogger(__name__)
@@ -164,7 +164,7 @@ def checked_kept_name(name: str, taken: frozenset[str], what: str) -> str:
     name = " ".join(name.split())
     if not name or len(name) > _MOST_LETTERS:
         raise UsageError(f"Type a name of 1 to {_MOST_LETTERS} letters first.")
-    if plain(name) != name:
+    if without_markup(name) != name:
         raise UsageError("A preset's name is made of letters, digits, blanks and . , : ( ) + - / _")
     if name.casefold() in taken:
         raise UsageError(f"'{name}' is a {what} of the program. Choose another name.")

@@ -13,7 +13,7 @@ import viser
 from app.keys import Action
 from app.viewer.content.content import Content
 from app.viewer.live.client import STARTING, LiveRollouts, Readout
-from app.viewer.physics.history import History, Setting
+from app.viewer.physics.history import History, TriedSetting
 from app.viewer.physics.keep_panel import KeepPanel, PresetChoice, UserStorage
 from app.viewer.physics.parameters import (
     FACTOR_MARKS,
@@ -131,7 +131,7 @@ class SubstepsChoice:
         guard: Guard,
         history: History,
         gestures: Gestures,
-        change: Callable[[Callable[[], Setting]], None],
+        change: Callable[[Callable[[], TriedSetting]], None],
     ) -> None:
         """Add the choice where the caller stands.
 
@@ -255,7 +255,7 @@ class PhysicsPanel:
         fitted = rollouts.fitted
         self.history = History(fitted.parameters, fitted.edits)
         self._gestures = Gestures(server.gui)
-        self._step_texts: dict[tuple[Setting, Setting], str] = {}
+        self._step_texts: dict[tuple[TriedSetting, TriedSetting], str] = {}
         self._rollouts = rollouts
         self._listener: Callable[[], None] = lambda: None
         self._is_held = False
@@ -333,7 +333,7 @@ class PhysicsPanel:
             title: What the list of steps calls it.
         """
 
-        def put() -> Setting:
+        def put() -> TriedSetting:
             before = self.history.setting
             after = self.history.edit(edits)
             self._step_texts[before, after] = title
@@ -479,7 +479,7 @@ class PhysicsPanel:
         # Stepping simulates the fitted parameters, too: a reset shows what was stored of them.
         self._change(change, always=name == _RESET)
 
-    def _change(self, change: Callable[[], Setting], *, always: bool = False) -> None:
+    def _change(self, change: Callable[[], TriedSetting], *, always: bool = False) -> None:
         """Simulate what a change of the history puts in force, and move the controls to it."""
         with self._lock:
             before = self.history.setting
@@ -489,7 +489,7 @@ class PhysicsPanel:
             self._sliders.show()
             self._substeps.show()
 
-    def _simulate(self, setting: Setting) -> None:
+    def _simulate(self, setting: TriedSetting) -> None:
         """Simulate a setting and say what it changes, leaving the controls alone."""
         self._rollouts.request(
             setting.parameters, automatic_substeps=setting.is_automatic, edits=setting.edits
@@ -536,7 +536,7 @@ class PhysicsPanel:
         self._steps.show(names[history.index])
 
 
-def step_text(knobs: tuple[Knob | Switch, ...], before: Setting, after: Setting) -> str:
+def step_text(knobs: tuple[Knob | Switch, ...], before: TriedSetting, after: TriedSetting) -> str:
     """Say what a step changed, for example ``δ object [mm] 20 → 35``.
 
     Args:

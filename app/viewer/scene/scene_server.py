@@ -11,7 +11,7 @@ import viser._messages as messages
 
 from app.settings import WEB_ASSETS
 from app.viewer.content.session_state import Kind, Pose, SessionInfo
-from app.viewer.ui.guard import Guard, plain
+from app.viewer.ui.guard import Guard, without_markup
 
 SURROUNDINGS = WEB_ASSETS / "surroundings.jpg"
 """What lights the scene from all around, 256 x 128 px with a gain map: viser's "city", which is
@@ -87,7 +87,7 @@ class SceneServer(ABC):
         self._seen = time.monotonic()
         self._is_closed = False
         self._lock = threading.RLock()
-        self._server = start_viser(plain(title))
+        self._server = start_viser(without_markup(title))
         self._guard = Guard(self._server)
 
     @property

@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 _UNSAFE = re.compile(r"[^\w .,:()+\-/]")
 
 
-def plain(text: str) -> str:
+def without_markup(text: str) -> str:
     """Strip a name of everything that HTML could give a meaning.
 
     Args:

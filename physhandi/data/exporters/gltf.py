@@ -20,7 +20,7 @@ from physhandi.srgb import to_linear
 from physhandi.triangles import unit_normals
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
-"""How a primitive's vertices are joined."""
+"""Modes of a glTF primitive."""
 _COMPONENT = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _KIND = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _VERTICES, _INDICES = 34962, 34963

@@ -81,11 +81,11 @@ class SceneData:
     model: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
     """The springs' tensors, as a run stores them; none without an object."""
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """What the object was simulated with, by name; none if that is not known."""
+    """Simulation parameters of the object by name; empty if they are not known."""
     dt: float = 0.0
     """Length of one substep [s]; 0 if that is not known."""
     mass: ObjectMass | None = None
-    """What the object weighs; None if nobody knows."""
+    """Mass of the object; None if it is not known."""
     skins: Mapping[str, Mapping[str, ndarray]] = field(
         default_factory=dict[str, Mapping[str, ndarray]]
     )
@@ -94,7 +94,7 @@ class SceneData:
     """Sums the virtual springs' forces on each node in a frame, for nodes of 1 kg [N]; None if they
     are not known."""
     views: tuple[View, ...] = ()
-    """What cameras recorded of it, if that is there."""
+    """Recorded views, if they are there."""
 
     @property
     def frame_count(self) -> int:

@@ -37,7 +37,7 @@ class Twin:
     clearance: Float[ndarray, " node"]
     """Height above the ground at which each node touches it, until a restart [m]."""
     parameters: Mapping[str, Any]
-    """What the object was simulated with, by name."""
+    """Simulation parameters of the object by name."""
 
     def __init__(self, scene: SceneData, program: str) -> None:
         """Collect what a scene has.
@@ -81,7 +81,7 @@ class Twin:
 
     @property
     def about(self) -> str:
-        """What this is and what it weighs, in a sentence for people."""
+        """Description of the object and its mass, in a sentence for people."""
         mass, scene = self._scene.mass, self._scene
         weight = (
             "nobody knows what the object weighs, so each node weighs 1 kg, as in the model"

@@ -198,7 +198,7 @@ def _messages(reader: Any, topic: _Topic) -> Iterator[tuple[Any, Any, int]]:
 
 def _cameras(bag: Path, reader: Any) -> dict[str, list[_Topic]]:
     """Find the topics of each camera: at most one of color and one of depth."""
-    found: dict[str, list[_Topic]] = {}
+    cameras: dict[str, list[_Topic]] = {}
     by_topic: dict[str, list[Any]] = {}
     for connection in reader.connections:
         if connection.msgtype in {_IMAGE, _COMPRESSED} and connection.msgcount > 0:
@@ -211,23 +211,23 @@ def _cameras(bag: Path, reader: Any) -> dict[str, list[_Topic]]:
             name, "depth" in name.lower(), connections, sum(c.msgcount for c in connections)
         )
         topic.info = _info(reader, infos, name)
-        found.setdefault(_camera_name(name), []).append(topic)
-    if not found:
+        cameras.setdefault(_camera_name(name), []).append(topic)
+    if not cameras:
         names = ", ".join(sorted({c.topic for c in reader.connections})[:8]) or "none"
         fail(bag, f"has no color or depth images (sensor_msgs/Image). Its topics are {names}")
-    return {key: _chosen(bag, topics) for key, topics in found.items()}
+    return {key: _chosen(bag, topics) for key, topics in cameras.items()}
 
 
 def _chosen(bag: Path, topics: list[_Topic]) -> list[_Topic]:
     """Keep one topic of a kind: depth that is aligned to color first, raw images before coded."""
-    kept: list[_Topic] = []
+    chosen: list[_Topic] = []
     for is_depth in (False, True):
         own = [topic for topic in topics if topic.is_depth == is_depth]
         own.sort(key=lambda t: ("align" not in t.name, "ompressed" in t.name, len(t.name)))
         if own and own[0].info is None:
             fail(bag, f"has no CameraInfo for {own[0].name}. Record camera_info too")
-        kept.extend(own[:1])
-    return kept
+        chosen.extend(own[:1])
+    return chosen
 
 
 def _camera_name(topic: str) -> str:
@@ -349,8 +349,8 @@ def _store(folder: Path, number: int, topic: _Topic, message: Any, place: str) -
     else:
         kind, channels, conversion = _CODED.get(code, (None, 0, None))
     if kind is None:
-        known = ", ".join(_DEPTHS if topic.is_depth else _CODED)
-        fail(Path(place), f"is encoded as {message.encoding!r}; known are {known}")
+        encodings = ", ".join(_DEPTHS if topic.is_depth else _CODED)
+        fail(Path(place), f"is encoded as {message.encoding!r}; known are {encodings}")
     row = width * channels * np.dtype(kind).itemsize
     data = np.asarray(message.data, dtype=np.uint8)
     if message.step < row or len(data) < height * message.step:
@@ -390,15 +390,15 @@ def _sort_by_time(folder: Path, topic: _Topic) -> None:
     """Drop images that came twice, and write the times; bags may hold images out of order."""
     files = sorted(folder.iterdir())
     order = sorted(range(len(files)), key=lambda number: topic.stamps[number])
-    kept: list[int] = []
+    numbers: list[int] = []
     for number in order:
-        if kept and topic.stamps[number] == topic.stamps[kept[-1]]:
+        if numbers and topic.stamps[number] == topic.stamps[numbers[-1]]:
             files[number].unlink()
         else:
-            kept.append(number)
-    for place, number in enumerate(kept):
+            numbers.append(number)
+    for place, number in enumerate(numbers):
         files[number].rename(folder / f"t{place:06d}{files[number].suffix}")
-    times = "\n".join(str(topic.stamps[number]) for number in kept)
+    times = "\n".join(str(topic.stamps[number]) for number in numbers)
     (folder / "timestamps.txt").write_text(times + "\n")
 
 

@@ -49,13 +49,13 @@ class CharucoTarget:
         Raises:
             UsageError: If it is something else.
         """
-        found = re.fullmatch(r"(\d{1,3})x(\d{1,3}),(\d*\.?\d+)", text.replace(" ", ""))
-        if found is None:
+        match = re.fullmatch(r"(\d{1,3})x(\d{1,3}),(\d*\.?\d+)", text.replace(" ", ""))
+        if match is None:
             raise UsageError(
                 f"--charuco {text!r} is no board; write squares across and down and the side of a "
                 "square in metres, like 7x5,0.04."
             )
-        columns, rows, square = int(found[1]), int(found[2]), float(found[3])
+        columns, rows, square = int(match[1]), int(match[2]), float(match[3])
         if not (3 <= columns <= 40 and 3 <= rows <= 40 and 0.004 <= square <= 0.3):
             raise UsageError(
                 f"--charuco {text!r}: boards have 3 to 40 squares each way, of 0.004 to 0.3 m. The "
@@ -96,13 +96,13 @@ class AprilGrid:
             UsageError: If it is something else.
         """
         number = r"(\d*\.?\d+)"
-        found = re.fullmatch(rf"(\d{{1,2}})x(\d{{1,2}}),{number},{number}", text.replace(" ", ""))
-        if found is None:
+        match = re.fullmatch(rf"(\d{{1,2}})x(\d{{1,2}}),{number},{number}", text.replace(" ", ""))
+        if match is None:
             raise UsageError(
                 f"--april-grid {text!r} is no grid; write tags across and down, the side of a tag "
                 "and the gap between tags in metres, like 6x6,0.03,0.009."
             )
-        grid = cls(int(found[1]), int(found[2]), float(found[3]), float(found[4]))
+        grid = cls(int(match[1]), int(match[2]), float(match[3]), float(match[4]))
         is_plausible = 0.005 <= grid.side <= 0.3 and 0 < grid.gap <= grid.side
         if not (is_plausible and grid.columns * grid.rows >= 2):
             raise UsageError(
@@ -127,7 +127,7 @@ class AprilGrid:
 
 
 Board = CharucoTarget | AprilGrid
-"""What may lie on the table."""
+"""Calibration board that may lie on the table."""
 
 
 def parse_board(charuco: str, april_grid: str) -> Board | None:
@@ -399,8 +399,8 @@ def _adjusted(
         return np.concatenate([*parts, value[-1:] / _THICKNESS])
 
     start = np.zeros(6 * (len(views) + len(places)) + 1)
-    found: Any = optimize.least_squares(residuals, start, loss="soft_l1", x_scale="jac")
-    return *unpacked(found.x), float(found.x[-1])
+    solution: Any = optimize.least_squares(residuals, start, loss="soft_l1", x_scale="jac")
+    return *unpacked(solution.x), float(solution.x[-1])
 
 
 def _moved(pose: ndarray, step: ndarray) -> ndarray:

@@ -84,7 +84,7 @@ _PNG_EFFORT = 2
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
-    """What a recording does not say itself."""
+    """Options of an import: all that the recording does not say itself."""
 
     depth_scale: float | None = None
     """Metres per unit of depth images; a value above 1 is units per metre. None: as recorded."""
@@ -244,7 +244,7 @@ def _is_made_of(folder: Path, origin: str) -> bool:
 
 def _origin(given: Path, sources: list[_Source], options: CaptureOptions) -> str:
     """Name all that images are made from: files, lenses, scales and the choice of frames."""
-    told = hashlib.sha256(repr((physhandi.__version__, options)).encode())
+    digest = hashlib.sha256(repr((physhandi.__version__, options)).encode())
     for source in sources:
         view = source.view
         lenses = [view.camera, *([view.depth_camera] if view.depth_camera is not None else [])]
@@ -252,9 +252,9 @@ def _origin(given: Path, sources: list[_Source], options: CaptureOptions) -> str
         arrays += [
             one for one in (view.T_color_depth, source.color, source.depth) if one is not None
         ]
-        told.update(repr((view.name, view.size, source.scale, len(arrays))).encode())
+        digest.update(repr((view.name, view.size, source.scale, len(arrays))).encode())
         for array in arrays:
-            told.update(np.ascontiguousarray(array).tobytes())
+            digest.update(np.ascontiguousarray(array).tobytes())
     # Bags are unpacked anew each time, so they stand for their images.
     files = find_bags(given) or [
         file
@@ -265,13 +265,13 @@ def _origin(given: Path, sources: list[_Source], options: CaptureOptions) -> str
     for file in files:
         for path in [file] if file.is_file() else sorted(file.rglob("*")):
             status = path.stat()
-            told.update(f"{path} {status.st_size} {status.st_mtime_ns}\n".encode())
-    return told.hexdigest()
+            digest.update(f"{path} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyedView:
-    """What a view of a recording holds."""
+    """Contents of one view of a recording."""
 
     name: str
     """Name."""
@@ -289,7 +289,7 @@ class SurveyedView:
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSurvey:
-    """What a recording holds, by its headers and a few depth images."""
+    """Contents of a recording, by its headers and a few depth images."""
 
     bags: tuple[str, ...] = ()
     """Bags, of which everything else is only known when they are unpacked."""
@@ -304,9 +304,9 @@ class CaptureSurvey:
     board: str = ""
     """Board that the recording names."""
     notes: tuple[str, ...] = ()
-    """What is repaired or assumed."""
+    """Repairs and assumptions, as sentences."""
     problems: tuple[str, ...] = ()
-    """What is missing or wrong, each with what to do; an import would fail."""
+    """Problems with which an import would fail, each with its remedy."""
 
     def to_dict(self) -> dict[str, Any]:
         """Give it as plain data."""
@@ -341,9 +341,9 @@ def _surveyed(source: Path, views: list[RecordedView], options: CaptureOptions) 
     try:
         paired = _paired(views, options)
         _check_images(views, paired)
-        sources, told = _sources(views, paired, options)
+        sources, remarks = _sources(views, paired, options)
         scales = {one.view.name: one.scale for one in sources if one.view.depth is not None}
-        notes += [*told, *paired.notes]
+        notes += [*remarks, *paired.notes]
     except (ImportFailedError, UsageError) as error:
         problems.append(str(error))
     try:
@@ -492,9 +492,9 @@ def _depth_scale(
     for place in chosen:
         raw = stream.read(int(there[place]))
         is_float = raw.dtype.kind == "f"
-        known = raw[(raw > 0) & (raw < _NO_DISTANCE)] if is_float else raw[raw > 0]
-        if known.size:
-            medians.append(float(np.median(known)))
+        measured = raw[(raw > 0) & (raw < _NO_DISTANCE)] if is_float else raw[raw > 0]
+        if measured.size:
+            medians.append(float(np.median(measured)))
     if not medians:
         fail(
             stream.path,
@@ -641,20 +641,21 @@ def _by_board(source: Path, sources: list[_Source], target: Board) -> _Placement
     names = [one.view.name for one in sources]
     lenses = [one.rectifier.K for one in sources]
     sizes = [one.view.size for one in sources]
-    found = calibrate_by_board(names, lenses, sizes, sightings)
+    calibration = calibrate_by_board(names, lenses, sizes, sightings)
     tables = [
-        _table_points(one, pose) for one, pose in zip(sources, found.T_world_camera, strict=True)
+        _table_points(one, pose)
+        for one, pose in zip(sources, calibration.T_world_camera, strict=True)
     ]
     if any(map(len, tables)):
-        found = calibrate_by_board(names, lenses, sizes, sightings, tables)
+        calibration = calibrate_by_board(names, lenses, sizes, sightings, tables)
     report = {
         "by": f"{BY_BOARD}, {_described(target)}",
         "reprojection_error_px": {
-            name: round(error, 3) for name, error in zip(names, found.error, strict=True)
+            name: round(error, 3) for name, error in zip(names, calibration.error, strict=True)
         },
-        "corners": dict(zip(names, found.corner_count, strict=True)),
+        "corners": dict(zip(names, calibration.corner_count, strict=True)),
     }
-    return _Placement(found.T_world_camera, 0.0, report, [])
+    return _Placement(calibration.T_world_camera, 0.0, report, [])
 
 
 def _described(target: Board) -> str:
@@ -687,9 +688,9 @@ def _sightings(
         count = min(_FIRST_FRAMES, 0 if one.color is None else len(one.color))
         # The board lies still at the beginning, so the first frame in which it is seen is enough.
         for frame in range(count):
-            found = find_board(one.color_image(frame), target)
-            if found is not None:
-                return [found]
+            sighting = find_board(one.color_image(frame), target)
+            if sighting is not None:
+                return [sighting]
         return [None]
     sightings: list[BoardSighting | None] = []
     for path in files:

@@ -71,8 +71,8 @@ def read_mesh(path: Path | str) -> Mesh:
             "it, for example by Blender's Decimate."
         )
     # A surface without any color is white in every viewer; that says nothing about the object.
-    known = [color for color in colors if color is not None]
-    color = np.concatenate(known) if len(known) == len(colors) else None
+    given = [color for color in colors if color is not None]
+    color = np.concatenate(given) if len(given) == len(colors) else None
     return _welded(vertex, face, color)
 
 

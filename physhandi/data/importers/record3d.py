@@ -96,16 +96,16 @@ def _metadata(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
 
 
 def _frames(path: Path, archive: zipfile.ZipFile) -> list[int]:
-    found: dict[str, set[int]] = {"jpg": set(), "depth": set(), "conf": set()}
+    numbers: dict[str, set[int]] = {"jpg": set(), "depth": set(), "conf": set()}
     for name in archive.namelist():
         match = _FRAME.fullmatch(name)
         if match is not None:
-            found[match[2]].add(int(match[1]))
-    lacking = found["jpg"] ^ found["depth"]
-    if lacking or not found["jpg"]:
+            numbers[match[2]].add(int(match[1]))
+    lacking = numbers["jpg"] ^ numbers["depth"]
+    if lacking or not numbers["jpg"]:
         what = f"frame {min(lacking)} has only one of both" if lacking else "there is none"
         fail(path, f"needs color and depth of every frame in rgbd/, but {what}")
-    return sorted(found["jpg"])
+    return sorted(numbers["jpg"])
 
 
 def _check_still(path: Path, table: dict[str, Any], count: int) -> None:

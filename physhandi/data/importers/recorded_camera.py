@@ -55,7 +55,7 @@ _COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordedCamera:
-    """What a recording says about one camera."""
+    """Properties of one camera as a recording stores them."""
 
     path: Path
     """File that says it."""
@@ -257,9 +257,9 @@ def _first(fields: Mapping[str, Any], names: tuple[str, ...]) -> tuple[str, Any]
 
 
 def _intrinsics(path: Path, at: str, fields: Mapping[str, Any]) -> Float[ndarray, "3 3"]:
-    found = _first(fields, (*_K, "intrinsics", "intrinsic"))
-    if found is not None and not isinstance(found[1], int | float):
-        return _matrix(path, f"{at}{found[0]}", found[1])
+    entry = _first(fields, (*_K, "intrinsics", "intrinsic"))
+    if entry is not None and not isinstance(entry[1], int | float):
+        return _matrix(path, f"{at}{entry[0]}", entry[1])
     K = np.eye(3)
     focal, center = fields.get("focal_length"), fields.get("principal_point")
     if focal is not None:
@@ -303,10 +303,10 @@ def _numbers(path: Path, name: str, value: Any, *counts: int) -> ndarray:
 
 
 def _field(path: Path, at: str, fields: Mapping[str, Any], names: tuple[str, ...]) -> float:
-    found = _first(fields, names)
-    if found is None:
+    entry = _first(fields, names)
+    if entry is None:
         fail(path, f"{at}field '{names[0]}' is missing; add it, in pixels")
-    return float(_numbers(path, f"{at}{found[0]}", found[1], 1)[0])
+    return float(_numbers(path, f"{at}{entry[0]}", entry[1], 1)[0])
 
 
 def _optional(
@@ -316,12 +316,12 @@ def _optional(
     names: tuple[str, ...],
     limits: tuple[float, float],
 ) -> float | None:
-    found, (low, high) = _first(fields, names), limits
-    if found is None:
+    entry, (low, high) = _first(fields, names), limits
+    if entry is None:
         return None
-    value = float(_numbers(path, f"{at}{found[0]}", found[1], 1)[0])
+    value = float(_numbers(path, f"{at}{entry[0]}", entry[1], 1)[0])
     if not low <= value <= high:
-        fail(path, f"{at}{found[0]} is {value:g}; expected {low:g} to {high:g}")
+        fail(path, f"{at}{entry[0]} is {value:g}; expected {low:g} to {high:g}")
     return value
 
 
@@ -338,12 +338,12 @@ def _size(path: Path, at: str, fields: Mapping[str, Any]) -> tuple[int, int] | N
 
 
 def _distortion(path: Path, at: str, fields: Mapping[str, Any]) -> Float[ndarray, " coefficient"]:
-    found = _first(fields, _DISTORTION)
-    if found is None:
+    entry = _first(fields, _DISTORTION)
+    if entry is None:
         named = [fields.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")]
         value: Any = named if any(named) else []
     else:
-        value = found[1]
+        value = entry[1]
         if isinstance(value, dict):
             inner = cast("dict[str, Any]", value)
             value = inner.get("data", [inner.get(n, 0.0) for n in ("k1", "k2", "p1", "p2", "k3")])
@@ -355,25 +355,25 @@ def _distortion(path: Path, at: str, fields: Mapping[str, Any]) -> Float[ndarray
 
 
 def _model(path: Path, at: str, fields: Mapping[str, Any]) -> str:
-    found = _first(fields, _MODEL)
-    model = "" if found is None else str(found[1]).lower().replace(" ", "_").replace("-", "_")
+    entry = _first(fields, _MODEL)
+    model = "" if entry is None else str(entry[1]).lower().replace(" ", "_").replace("-", "_")
     model = model.removeprefix("distortion.")
     if model not in _PLAIN | FISHEYE | INVERSE and len(_distortion(path, at, fields)):
-        known = ", ".join(sorted(_PLAIN - {""} | FISHEYE | INVERSE))
-        fail(path, f"{at}the lens model {model!r} is not known. Give one of {known}")
+        models = ", ".join(sorted(_PLAIN - {""} | FISHEYE | INVERSE))
+        fail(path, f"{at}the lens model {model!r} is not known. Give one of {models}")
     return model
 
 
 def _depth_scale(path: Path, at: str, fields: Mapping[str, Any], depth: Any) -> float | None:
     """Read metres per unit; values above 1 are units per metre, as Open3D and TUM give them."""
-    found = _first(fields, _SCALE)
-    if found is None and isinstance(depth, dict):
-        found = _first(cast("dict[str, Any]", depth), (*_SCALE, "scale"))
-    if found is None:
+    entry = _first(fields, _SCALE)
+    if entry is None and isinstance(depth, dict):
+        entry = _first(cast("dict[str, Any]", depth), (*_SCALE, "scale"))
+    if entry is None:
         return None
-    value = float(_numbers(path, f"{at}{found[0]}", found[1], 1)[0])
+    value = float(_numbers(path, f"{at}{entry[0]}", entry[1], 1)[0])
     if not (value > 0 and math.isfinite(value)):
-        fail(path, f"{at}{found[0]} is {value:g}; expected metres per unit, such as 0.001")
+        fail(path, f"{at}{entry[0]} is {value:g}; expected metres per unit, such as 0.001")
     return value if value <= 1.0 else 1.0 / value
 
 
@@ -388,5 +388,5 @@ def _pose(path: Path, at: str, fields: Mapping[str, Any]) -> Float[ndarray, "4 4
 def _rigid_field(
     path: Path, at: str, fields: Mapping[str, Any], names: tuple[str, ...]
 ) -> Float[ndarray, "4 4"] | None:
-    found = _first(fields, names)
-    return None if found is None else read_pose(path, found[1], f"{at}{found[0]}")
+    entry = _first(fields, names)
+    return None if entry is None else read_pose(path, entry[1], f"{at}{entry[0]}")

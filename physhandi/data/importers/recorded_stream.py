@@ -57,7 +57,7 @@ class RecordedStream:
     """Images of one kind that one camera took, in their order."""
 
     kind: StreamKind
-    """What the images show."""
+    """Kind of the images."""
     path: Path
     """Folder of the images, or the video."""
     files: tuple[Path, ...] = ()
@@ -73,7 +73,7 @@ class RecordedStream:
     time: Float[ndarray, " image"] | None = None
     """When each image was taken [s]; None if that is not known."""
     time_source: str = ""
-    """What `time` was read from, for messages."""
+    """Source of `time`, for messages."""
     frame_rate: float | None = None
     """Frames per second that a video states [Hz]."""
 
@@ -227,9 +227,9 @@ def find_stream(folder: Path, kind: StreamKind) -> RecordedStream | None:
         ImportFailedError: If there are two candidates, or what is there cannot be read.
     """
     word = re.compile(f"(?:{_WORDS[kind]})", re.IGNORECASE)
-    found = [item for item in sorted(folder.iterdir()) if word.fullmatch(item.stem)]
-    folders = [item for item in found if item.is_dir()]
-    is_video = [item for item in found if item.is_file() and item.suffix.lower() in VIDEO_SUFFIXES]
+    items = [item for item in sorted(folder.iterdir()) if word.fullmatch(item.stem)]
+    folders = [item for item in items if item.is_dir()]
+    is_video = [item for item in items if item.is_file() and item.suffix.lower() in VIDEO_SUFFIXES]
     if kind == "color" and not folders and not is_video:
         is_video = [
             item for item in sorted(folder.iterdir()) if item.suffix.lower() in VIDEO_SUFFIXES
@@ -279,10 +279,10 @@ def image_stream(kind: StreamKind, path: Path, files: list[Path]) -> RecordedStr
     stream = RecordedStream(
         kind=kind, path=path, files=tuple(files), width=width, height=height, count=len(files)
     )
-    found = [_NUMBER.findall(file.stem) for file in files]
-    if not all(found):
+    number_texts = [_NUMBER.findall(file.stem) for file in files]
+    if not all(number_texts):
         return stream
-    texts = [numbers[-1] for numbers in found]
+    texts = [numbers[-1] for numbers in number_texts]
     _refuse_twice(files, texts)
     values = np.array([float(text) for text in texts])
     if _are_times(texts, values):
@@ -461,8 +461,8 @@ def _time_text(path: Path, value: Any) -> str:
 
 def _by_name(path: Path, stream: RecordedStream, table: Mapping[str, str]) -> list[str]:
     """Order times as the images that they name."""
-    known = {Path(name).stem: text for name, text in table.items()}
+    times = {Path(name).stem: text for name, text in table.items()}
     for file in stream.files:
-        if file.stem not in known:
+        if file.stem not in times:
             fail(path, f"has no time for {file.name}. Add it, or remove the image")
-    return [known[file.stem] for file in stream.files]
+    return [times[file.stem] for file in stream.files]

@@ -67,7 +67,7 @@ class RecordedView:
     depth_scale: float | None = None
     """Metres per unit of depth that the recording states."""
     notes: list[str] = field(default_factory=list[str])
-    """What was assumed, as sentences."""
+    """Assumptions, as sentences."""
 
     @property
     def streams(self) -> tuple[RecordedStream, ...]:
@@ -108,17 +108,17 @@ def find_views(source: Path, intrinsics: Path | None = None) -> list[RecordedVie
         )
     if (source / "metadata.json").is_file() and _numbered(source / "color"):
         return _phystwin_views(source)
-    found = _camera_folders(source)
-    if not found:
+    folders = _camera_folders(source)
+    if not folders:
         raise ImportFailedError(
             f"{source} holds no recording: neither it nor a folder in it has color or depth (as "
             "color/00000.png or color.mp4, and depth/00000.png or .npy)."
         )
     shared = _shared_table(source, intrinsics)
-    poses = _shared_poses(source, [item.name for item in found])
+    poses = _shared_poses(source, [item.name for item in folders])
     return [
-        _view(item, shared, poses.get(item.name), is_alone=len(found) == 1, order=order)
-        for order, item in enumerate(found)
+        _view(item, shared, poses.get(item.name), is_alone=len(folders) == 1, order=order)
+        for order, item in enumerate(folders)
     ]
 
 
@@ -138,19 +138,19 @@ def _camera_folders(source: Path) -> list[_Folder]:
     own = _streams(source, "view0")
     if own is not None:
         return [own]
-    found: list[_Folder] = []
+    folders: list[_Folder] = []
     for folder in sorted(source.iterdir()):
         if not folder.is_dir() or folder.name.startswith(".") or folder.name == CALIBRATION:
             continue
-        streams = _streams(folder, _safe_name(folder.name, len(found)))
+        streams = _streams(folder, _safe_name(folder.name, len(folders)))
         if streams is None:
             images = [path for path in folder.iterdir() if path.suffix.lower() in COLOR_SUFFIXES]
             if images:
                 color = image_stream("color", folder, images)
-                streams = _Folder(_safe_name(folder.name, len(found)), folder, color, None)
+                streams = _Folder(_safe_name(folder.name, len(folders)), folder, color, None)
         if streams is not None:
-            found.append(streams)
-    return found
+            folders.append(streams)
+    return folders
 
 
 def _streams(folder: Path, name: str) -> _Folder | None:
@@ -226,47 +226,47 @@ def _in_order(path: Path, names: list[str], poses: list[ndarray]) -> dict[str, n
 
 
 def _view(
-    found: _Folder,
+    streams: _Folder,
     shared: tuple[Path, Any] | None,
     pose: ndarray | None,
     *,
     is_alone: bool,
     order: int,
 ) -> RecordedView:
-    camera = _camera(found, shared, is_alone=is_alone, order=order)
-    stream = found.color or found.depth
+    camera = _camera(streams, shared, is_alone=is_alone, order=order)
+    stream = streams.color or streams.depth
     assert stream is not None  # noqa: S101 - a folder without streams is no camera
     grid = camera
-    if found.color is None and camera.depth is not None:
+    if streams.color is None and camera.depth is not None:
         grid = camera.depth
     check_camera(grid, stream.width, stream.height, stream.path)
     view = RecordedView(
-        name=found.name,
-        folder=found.folder,
-        color=found.color,
-        depth=found.depth,
+        name=streams.name,
+        folder=streams.folder,
+        color=streams.color,
+        depth=streams.depth,
         camera=grid,
         T_world_camera=camera.T_world_camera if pose is None else pose,
         depth_scale=camera.depth_scale,
     )
     if view.T_world_camera is None:
-        own = _table_file(found.folder, _EXTRINSICS, ".txt", ".npy")
+        own = _table_file(streams.folder, _EXTRINSICS, ".txt", ".npy")
         view.T_world_camera = None if own is None else read_pose_file(own)
     for one in view.streams:
-        read_times(found.folder, one)
+        read_times(streams.folder, one)
         one.frame_rate = one.frame_rate or camera.frame_rate
-    if found.color is not None and found.depth is not None:
+    if streams.color is not None and streams.depth is not None:
         _place_depth(view, camera)
     return view
 
 
 def _camera(
-    found: _Folder, shared: tuple[Path, Any] | None, *, is_alone: bool, order: int
+    streams: _Folder, shared: tuple[Path, Any] | None, *, is_alone: bool, order: int
 ) -> RecordedCamera:
     own = None
     if not is_alone or shared is None:
-        own = _table_file(found.folder, _INTRINSICS, ".txt") or next(
-            (path for path in (found.folder / "K.txt",) if path.is_file()), None
+        own = _table_file(streams.folder, _INTRINSICS, ".txt") or next(
+            (path for path in (streams.folder / "K.txt",) if path.is_file()), None
         )
     if own is not None:
         if own.suffix == ".txt":
@@ -274,14 +274,14 @@ def _camera(
         return read_camera(own, read_table(own))
     if shared is None:
         fail(
-            found.folder,
+            streams.folder,
             "has no intrinsics. Add intrinsics.json with fx, fy, cx, cy, width and height in "
             "pixels, or give --intrinsics",
         )
     path, table = shared
     if isinstance(table, dict):
         fields = cast("dict[Any, Any]", table)
-        key: Any = next((k for k in (found.name, found.folder.name) if k in fields), None)
+        key: Any = next((k for k in (streams.name, streams.folder.name) if k in fields), None)
         if key is not None:
             return read_camera(path, fields[key], str(key))
     elif isinstance(table, list):
@@ -394,11 +394,11 @@ def _step_times(path: Path, stream: RecordedStream, steps: Any, number: int) -> 
     own: Any = table.get(str(number), table.get(number))
     if not isinstance(own, Mapping):
         return
-    known = {str(step): time for step, time in cast("Mapping[Any, Any]", own).items()}
-    missing = [step for step in stream.number if str(step) not in known]
+    time_of = {str(step): time for step, time in cast("Mapping[Any, Any]", own).items()}
+    missing = [step for step in stream.number if str(step) not in time_of]
     if missing:
         fail(path, f"recording.{number} has no time for step {missing[0]} of {stream.path}")
-    times = np.array([known[str(step)] for step in stream.number], dtype=np.float64)
+    times = np.array([time_of[str(step)] for step in stream.number], dtype=np.float64)
     back = np.flatnonzero(~(np.diff(times) > 0))
     if len(back):
         step = stream.number[int(back[0]) + 1]

@@ -62,12 +62,12 @@ class Rectifier:
         nearest surface covers the others.
         """
         is_known = np.isfinite(image) & (image > 0) & (image < _FARTHEST)
-        known = np.where(is_known, image, 0.0).astype(np.float32)
+        measured = np.where(is_known, image, 0.0).astype(np.float32)
         if self._ray is not None:
-            return self._reprojected(known)
+            return self._reprojected(measured)
         if self._map is None:
-            return known
-        return cast("ndarray", cv2.remap(known, *self._map, cv2.INTER_NEAREST))
+            return measured
+        return cast("ndarray", cv2.remap(measured, *self._map, cv2.INTER_NEAREST))
 
     def _reprojected(self, depth: Float[ndarray, "row column"]) -> Float[ndarray, "height width"]:
         assert self._ray is not None  # noqa: S101 - its only caller has asked

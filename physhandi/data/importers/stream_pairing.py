@@ -30,7 +30,7 @@ class PairedFrames:
     error: tuple[Float[ndarray, " frame"] | None, ...]
     """For each stream how far its image is from the frame's moment [s]; None without times."""
     notes: tuple[str, ...]
-    """What was repaired or assumed, as sentences."""
+    """Repairs and assumptions, as sentences."""
 
     @property
     def count(self) -> int:
@@ -73,9 +73,9 @@ def pair_streams(
         stream.number or (tuple(range(stream.count)) if not stream.files else None)
         for stream in streams
     ]
-    known = [number for number in numbers if number is not None]
-    if len(known) == len(streams) and not _is_counted_apart(known):
-        return _by_number(names, streams, known, frame_rate, notes)
+    numbered = [number for number in numbers if number is not None]
+    if len(numbered) == len(streams) and not _is_counted_apart(numbered):
+        return _by_number(names, streams, numbered, frame_rate, notes)
     return _by_order(names, streams, frame_rate, notes)
 
 
@@ -92,12 +92,12 @@ def cut(paired: PairedFrames, start: int, stop: int | None, every: int) -> Paire
             f"--start {start} --stop {last} --every {every}: the recording has frames 0 to "
             f"{count - 1}, so stop is at most {count}, start at least 0, and every at least 1."
         )
-    kept = range(start, last, every)
-    if len(kept) < 2:
+    frames = range(start, last, every)
+    if len(frames) < 2:
         chosen = "" if count < 2 else f", and --start {start} --stop {last} --every {every} leave"
         raise UsageError(
             f"The recording has {count} common frame{'' if count == 1 else 's'}{chosen}"
-            f"{f' {len(kept)}' if chosen else ''}; a motion needs at least 2."
+            f"{f' {len(frames)}' if chosen else ''}; a motion needs at least 2."
         )
     return replace(
         paired,
@@ -135,11 +135,11 @@ def _by_time(names: Sequence[str], streams: Sequence[RecordedStream]) -> PairedF
     for name, stream, time in zip(names, streams, times, strict=True):
         nearest = _nearest(time, moments)
         away = np.subtract(time[nearest], moments)
-        chosen, told = _mended(name, stream.kind, nearest, np.abs(away) > NEAREST * period)
+        chosen, remarks = _mended(name, stream.kind, nearest, np.abs(away) > NEAREST * period)
         away[chosen < 0] = np.nan
         index.append(chosen)
         error.append(away)
-        notes.extend(told)
+        notes.extend(remarks)
     return PairedFrames(
         frame_rate=1.0 / period, index=tuple(index), error=tuple(error), notes=tuple(notes)
     )
@@ -201,12 +201,14 @@ def _by_number(
     index: list[ndarray] = []
     for name, stream, number in zip(names, streams, numbers, strict=True):
         place = {value: at for at, value in enumerate(number)}
-        known = np.array(number)
-        nearest = np.array([place.get(f, int(np.abs(known - f).argmin())) for f in frames.tolist()])
+        available = np.array(number)
+        nearest = np.array(
+            [place.get(f, int(np.abs(available - f).argmin())) for f in frames.tolist()]
+        )
         lost = np.array([f not in place for f in frames.tolist()])
-        chosen, told = _mended(name, stream.kind, nearest, lost, frames)
+        chosen, remarks = _mended(name, stream.kind, nearest, lost, frames)
         index.append(chosen)
-        notes.extend(told)
+        notes.extend(remarks)
         spare = [value for value in number if not first <= value <= last]
         if spare:
             notes.append(

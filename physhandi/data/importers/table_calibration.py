@@ -55,7 +55,7 @@ class TablePattern:
     point: Float[ndarray, "place 2"]
     """Where they are, in table coordinates of this view [m]."""
     descriptor: Float32[ndarray, "place 128"]
-    """What they look like."""
+    """SIFT descriptors of these places."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +120,12 @@ def see_pattern(
     gray = cv2.createCLAHE(3.0, (8, 8)).apply(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
     # Without the precise upscale all places are shifted by a part of a pixel, which is 1 to 2 mm.
     finder = cv2.SIFT.create(_FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
-    found, descriptor = finder.detectAndCompute(gray, mask)
-    if not found:
+    keypoints, descriptor = finder.detectAndCompute(gray, mask)
+    if not keypoints:
         return TablePattern(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     # Hellinger's distance instead of Euclid's (Arandjelovic and Zisserman, 2012).
     shape = np.sqrt(descriptor / np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-9))
-    place = np.array([one.pt for one in found]) * cell + low
+    place = np.array([one.pt for one in keypoints]) * cell + low
     return TablePattern(place, shape.astype(np.float32))
 
 
@@ -144,17 +144,17 @@ def lay_patterns(
     matches = [_matches(a, b) for a, b in zip(moving, fixed, strict=True)]
     source = np.concatenate([a for a, _ in matches])
     target = np.concatenate([b for _, b in matches])
-    found = _solutions(source, target)
-    if not found:
+    solutions = _solutions(source, target)
+    if not solutions:
         return None
-    angle, shift, agrees = found[0]
+    angle, shift, agrees = solutions[0]
     rest = target[agrees] - source[agrees] @ _turn(angle).T - shift
     spread = np.linalg.eigvalsh(np.cov(source[agrees].T))[0]
     return PatternFit(
         angle=angle,
         shift=shift,
         place_count=int(agrees.sum()),
-        rival_count=max((int(other[2].sum()) for other in found[1:]), default=0),
+        rival_count=max((int(other[2].sum()) for other in solutions[1:]), default=0),
         spread=float(np.sqrt(max(spread, 0.0))),
         error=float(np.sqrt((rest**2).sum(axis=1).mean())),
         middle=source[agrees].mean(axis=0),
@@ -291,8 +291,8 @@ def _matches(
     second = np.partition(alike, -2, axis=1)[:, -2]
     is_clear = (2.0 - 2.0 * first) < _RATIO**2 * (2.0 - 2.0 * second)
     is_mutual = alike.argmax(axis=0)[best] == row
-    kept = is_clear & is_mutual
-    return moving.point[kept], fixed.point[best[kept]]
+    is_match = is_clear & is_mutual
+    return moving.point[is_match], fixed.point[best[is_match]]
 
 
 def _solutions(
@@ -320,10 +320,10 @@ def _solutions(
     count = (rest[0] ** 2 + rest[1] ** 2 < _TOLERANCE**2).sum(axis=1)
     middle = source.mean(axis=0)
     place_of = np.stack([(turned[k] + shift[k][:, None]).mean(axis=1) for k in (0, 1)], axis=1)
-    found: list[tuple[float, ndarray, ndarray]] = []
+    solutions: list[tuple[float, ndarray, ndarray]] = []
     is_left = np.ones(len(fits), dtype=bool)
     for _ in range(_FOLLOWED):
-        if not is_left.any() or len(found) == 2:
+        if not is_left.any() or len(solutions) == 2:
             break
         n = int(np.where(is_left, count, -1).argmax())
         is_left[n] = False
@@ -331,13 +331,13 @@ def _solutions(
         if one is None:
             continue
         place = _turn(one[0]) @ middle + one[1]
-        if all(_is_other(one, other, middle) for other in found):
-            found.append(one)
+        if all(_is_other(one, other, middle) for other in solutions):
+            solutions.append(one)
         # What lies beside it would only lead to it again.
         turn = np.abs((angles - one[0] + np.pi) % (2 * np.pi) - np.pi)
         is_beside = (np.linalg.norm(place_of - place, axis=1) < _OTHER[0]) & (turn < _OTHER[1])
         is_left &= ~is_beside
-    return sorted(found, key=lambda one: -int(one[2].sum()))
+    return sorted(solutions, key=lambda one: -int(one[2].sum()))
 
 
 def _is_other(

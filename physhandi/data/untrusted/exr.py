@@ -34,7 +34,7 @@ _PICTURE = ("r", "g", "b")
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """What a file with one flat image announces."""
+    """Header of a file with one flat image."""
 
     width: int
     """Width [px]."""
@@ -172,8 +172,8 @@ def decode_exr(path: str, names: list[str]) -> Float[ndarray, "row column *chann
     """
     package: Any = import_module("OpenEXR")
     try:
-        found = package.File(path, separate_channels=True, num_threads=0).channels()
-        channels = [cast("ndarray", found[name].pixels) for name in names]
+        by_name = package.File(path, separate_channels=True, num_threads=0).channels()
+        channels = [cast("ndarray", by_name[name].pixels) for name in names]
     except (RuntimeError, ValueError, KeyError):
         return None
     image = channels[0] if len(channels) == 1 else np.stack(channels, axis=-1)
@@ -183,18 +183,18 @@ def decode_exr(path: str, names: list[str]) -> Float[ndarray, "row column *chann
 def _attributes(stream: BinaryIO) -> dict[str, bytes]:
     """Read the attributes that are needed; the others are skipped."""
     needed = {"channels", "compression", "dataWindow", "displayWindow", "tiles"}
-    found: dict[str, bytes] = {}
+    attributes: dict[str, bytes] = {}
     for _ in range(_MOST_ATTRIBUTES):
         name = _text(stream)
         if not name:
-            return found
+            return attributes
         _text(stream)  # Type of the attribute.
         (length,) = struct.unpack("<i", stream.read(4))
         if length < 0 or (name in needed and length > _LONGEST_LIST):
             break
         if name in needed:
-            found[name] = stream.read(length)
-            if len(found[name]) < length:
+            attributes[name] = stream.read(length)
+            if len(attributes[name]) < length:
                 raise struct.error
         else:
             stream.seek(length, 1)
@@ -212,20 +212,20 @@ def _text(stream: BinaryIO) -> str:
 
 
 def _channels(content: bytes) -> dict[str, np.dtype[Any]]:
-    found: dict[str, np.dtype[Any]] = {}
+    channels: dict[str, np.dtype[Any]] = {}
     at = 0
     while at < len(content) and content[at]:
         end = content.find(b"\0", at)
         kind, x, y = struct.unpack_from("<i4x2i", content, end + 1)
-        if end < 0 or kind not in _NUMBERS or len(found) == _MOST_CHANNELS:
+        if end < 0 or kind not in _NUMBERS or len(channels) == _MOST_CHANNELS:
             raise ValueError(f"has a damaged list of channels, or more than {_MOST_CHANNELS}")
         if (x, y) != (1, 1):
             raise ValueError("has channels of several resolutions. Export depth alone")
-        found[content[at:end].decode("latin-1")] = _NUMBERS[kind]
+        channels[content[at:end].decode("latin-1")] = _NUMBERS[kind]
         at = end + 17
-    if not found:
+    if not channels:
         raise ValueError("has no channels in its OpenEXR header")
-    return found
+    return channels
 
 
 def _row_count(fields: Mapping[str, bytes], height: int) -> int:

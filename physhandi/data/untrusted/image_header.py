@@ -39,7 +39,7 @@ ImageForm = Literal["PNG", "JPEG", "EXR", "NPY"]
 
 @dataclass(frozen=True)
 class AnnouncedImage:
-    """What an image file announces."""
+    """Format and size of an image, by the header of its file."""
 
     form: ImageForm
     """Its format, by its content."""

@@ -79,8 +79,8 @@ class MediaDecoder:
         Raises:
             ImportFailedError: See `image`.
         """
-        told = self._ask(str(path), do="probe", path=str(path.absolute()))[0]["video"]
-        return int(told[0]), int(told[1]), int(told[2]), float(told[3])
+        answer = self._ask(str(path), do="probe", path=str(path.absolute()))[0]["video"]
+        return int(answer[0]), int(answer[1]), int(answer[2]), float(answer[3])
 
     def frame(self, path: Path, index: int) -> tuple[ndarray | None, int]:
         """Decode a frame of a video (BGR), best in their order.
@@ -93,8 +93,8 @@ class MediaDecoder:
             ImportFailedError: See `image`.
         """
         place = f"{path}, frame {index}"
-        told, image = self._ask(place, do="frame", path=str(path.absolute()), index=index)
-        return image, int(told["at"])
+        answer, image = self._ask(place, do="frame", path=str(path.absolute()), index=index)
+        return image, int(answer["at"])
 
     def release(self, path: Path) -> None:
         """Close a video."""

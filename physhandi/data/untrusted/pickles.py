@@ -78,7 +78,7 @@ class Inert(ABC):
 
 
 class Callee:
-    """What a pickle may call: one function of this module, and nothing of it can be set."""
+    """Function of this module that a pickle may call; no attribute of it can be set."""
 
     __slots__ = ("_function",)
 
@@ -395,7 +395,7 @@ STAND_INS: dict[str, dict[str, Any]] = {
     "chumpy.ch": {"Ch": Ch},
     "chumpy.reordering": {"Select": Select},
 }
-"""What each name in a pickle stands for; any other name is refused."""
+"""Stand-in of each name in a pickle; any other name is refused."""
 TORCH_STAND_INS: dict[str, dict[str, Any]] = {
     "torch": {
         **{f"{name}Storage": ElementType(code) for name, code in _TORCH_CODES.items()},
@@ -408,7 +408,7 @@ TORCH_STAND_INS: dict[str, dict[str, Any]] = {
         "_rebuild_parameter": Callee(_same),
     },
 }
-"""What else a torch checkpoint may name."""
+"""Stand-ins of further names in torch checkpoints."""
 
 
 TEXT_OF_ARCHIVES = zip_text.getregentry()
@@ -435,10 +435,10 @@ class InertUnpickler(pickle.Unpickler):
         Raises:
             ImportFailedError: If it has none.
         """
-        found = self._names.get(module, {}).get(name)
-        if found is None:
+        stand_in = self._names.get(module, {}).get(name)
+        if stand_in is None:
             raise ImportFailedError(f"it asks for {module}.{name}"[:200])
-        return found
+        return stand_in
 
     def persistent_load(self, pid: Any) -> Storage:
         """Read the storage of a torch tensor from the archive.
@@ -587,11 +587,11 @@ def read(source: Path, out: Path, most_bytes: int) -> None:
     with source.open("rb") as stream:
         watched = forbid_calls()
         try:
-            tree, found = convert(stream, most_bytes)
+            tree, arrays = convert(stream, most_bytes)
         finally:
             watched.clear()
-    arrays: Any = {str(number): array for number, array in enumerate(found)}
-    np.savez(out / "array.npz", allow_pickle=False, **arrays)
+    named: Any = {str(number): array for number, array in enumerate(arrays)}
+    np.savez(out / "array.npz", allow_pickle=False, **named)
     (out / "tree.json").write_text(json.dumps(tree), encoding="ascii")
 
 
@@ -746,8 +746,8 @@ def _reader() -> _Reader:
 def _ending(code: int) -> str:
     if code >= 0:
         return f"with exit code {code}"
-    known = {signal.SIGKILL: "for want of memory or time", signal.SIGXCPU: "for want of time"}
-    return known.get(signal.Signals(-code), f"by signal {-code}; it may be nested too deeply")
+    reasons = {signal.SIGKILL: "for want of memory or time", signal.SIGXCPU: "for want of time"}
+    return reasons.get(signal.Signals(-code), f"by signal {-code}; it may be nested too deeply")
 
 
 def _collect(folder: Path) -> Any:

@@ -73,9 +73,9 @@ class FitWarning:
     """One doubt about a fit."""
 
     code: Code
-    """Which kind of doubt."""
+    """Kind of warning."""
     message: str
-    """What was found, and what to do about it."""
+    """Finding and remedy, for people."""
 
 
 def with_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> dict[str, Any]:
@@ -93,10 +93,10 @@ def with_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> d
     Raises:
         RunError: If a file of the run is damaged.
     """
-    found = fit_warnings(out, sequence, scores)
-    if not found and not (out / SequenceFiles(sequence.name).model).is_file():
+    doubts = fit_warnings(out, sequence, scores)
+    if not doubts and not (out / SequenceFiles(sequence.name).model).is_file():
         return dict(scores)
-    return {**scores, "warnings": [asdict(warning) for warning in found]}
+    return {**scores, "warnings": [asdict(warning) for warning in doubts]}
 
 
 def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> list[FitWarning]:
@@ -113,16 +113,16 @@ def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> li
     """
     files = SequenceFiles(sequence.name)
     if not (out / files.model).is_file():
-        told = skipped_object([sequence])
-        skipped = [] if told is None else [FitWarning(code="object_skipped", message=told)]
+        message = skipped_object([sequence])
+        skipped = [] if message is None else [FitWarning(code="object_skipped", message=message)]
         return [*skipped, *_unseen_hands(out, sequence)]
-    found = [*_at_bounds(out), *_worse_than_baselines(scores), *_doubts_of_shape(out)]
+    doubts = [*_at_bounds(out), *_worse_than_baselines(scores), *_doubts_of_shape(out)]
     model = artefacts.load_model(out, sequence.name)
-    found += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
+    doubts += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
     if (out / files.observation("point")).is_file():
-        found += _few_observations(out, sequence)
-    found += _unseen_hands(out, sequence)
-    return found
+        doubts += _few_observations(out, sequence)
+    doubts += _unseen_hands(out, sequence)
+    return doubts
 
 
 def _doubts_of_shape(out: Path) -> Iterator[FitWarning]:

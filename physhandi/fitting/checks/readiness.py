@@ -1,4 +1,4 @@
-"""What each stage of a fit needs of its recordings, and whether they have it.
+"""Inputs that each stage of a fit needs, and whether recordings have them.
 
 The pipeline asks here which stages it runs; so do the command line, the API and the pages, before a
 fit is launched. Only the presence of files is looked at.
@@ -66,7 +66,7 @@ ABOUT: Mapping[str, str] = {
     APPEARANCE: "what the object looks like, as splats that its nodes carry",
     EVALUATION: "a rollout of all frames, and how well it went",
 }
-"""What each stage makes."""
+"""Result of each stage."""
 
 ReadyState = Literal["ready", "not needed", "missing"]
 
@@ -186,7 +186,7 @@ def readiness(
     of_all = StageReadiness()
     if not can_fit:
         of_all = _lacking({name: [*object_[name], *hands[name]] for name in hands})
-    found = {
+    stages = {
         HANDS: of_hands,
         OBSERVATION: of_object,
         SEARCH: of_object,
@@ -196,7 +196,7 @@ def readiness(
         EVALUATION: of_all,
     }
     planned = planned_stages(None if config is None else config.to_dict())
-    return {stage: found[stage] for stage in planned}
+    return {stage: stages[stage] for stage in planned}
 
 
 def colored_views(sequence: Sequence) -> tuple[View, ...]:
@@ -222,7 +222,7 @@ def _lacking(missing: Mapping[str, Many[str]], *, is_needed: bool = True) -> Sta
 
 def nothing_to_fit(sequences: Many[Sequence]) -> str:
     """Say what recordings lack in which there is nothing to fit, and how to get it."""
-    told: list[str] = []
+    clauses: list[str] = []
     parts: dict[str, None] = {}
     for sequence in sequences:
         of_object, of_hands = missing_for_object(sequence), missing_for_hands(sequence)
@@ -232,9 +232,9 @@ def nothing_to_fit(sequences: Many[Sequence]) -> str:
             lacks.append("shows no hands")
         elif of_hands:
             lacks.append(f"lacks {', '.join(of_hands)} for the hands")
-        told.append(f"'{sequence.name}' {' and '.join(lacks)}")
+        clauses.append(f"'{sequence.name}' {' and '.join(lacks)}")
     remedies = "; ".join(REMEDIES[part] for part in parts)
-    return f"There is nothing to fit: {'; '.join(told)}. To do: {remedies}."
+    return f"There is nothing to fit: {'; '.join(clauses)}. To do: {remedies}."
 
 
 def skipped_object(sequences: Many[Sequence], config: PipelineConfig | None = None) -> str | None:
@@ -242,9 +242,9 @@ def skipped_object(sequences: Many[Sequence], config: PipelineConfig | None = No
 
     Color alone shows hands and no more, so that leaving out an object is no surprise there.
     """
-    found = readiness(sequences, config)
-    of_object = found[OBSERVATION]
-    if of_object.is_ready or not found[EVALUATION].is_ready:
+    stages = readiness(sequences, config)
+    of_object = stages[OBSERVATION]
+    if of_object.is_ready or not stages[EVALUATION].is_ready:
         return None
     shows_depth = any(
         view.has_depth

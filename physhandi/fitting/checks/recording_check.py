@@ -61,7 +61,7 @@ class Problem:
     level: Level
     """``error``: breaks the format; ``warning``: readable, but a stage gets less than it could."""
     message: str
-    """What is wrong, as a sentence."""
+    """Description of the problem, as a sentence."""
     file: str = ""
     """File or folder below that of the sequence; empty where no single one is to blame."""
     frame: int | None = None
@@ -71,17 +71,17 @@ class Problem:
     field: str = ""
     """Field of ``sequence.yaml``, or place in an array."""
     remedy: str = ""
-    """What to do, as part of a sentence."""
+    """Remedy, as part of a sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingCheck:
-    """What can be done with a recording, and what is wrong with it."""
+    """Readiness of a recording for each stage, and its problems."""
 
     stages: Mapping[str, StageReadiness]
     """A stage's readiness by its name, in the order of the stages."""
     problems: tuple[Problem, ...]
-    """What was found, errors first."""
+    """Problems, errors first."""
 
     @property
     def error(self) -> str | None:
@@ -143,8 +143,8 @@ def check_recording(
         return RecordingCheck(stages=stages, problems=tuple(_limited(errors)))
     warnings: list[Problem] = []
     if stages[HANDS].is_ready:
-        found, is_seen = _judge_hands(sequence)
-        warnings += found
+        doubts, is_seen = _judge_hands(sequence)
+        warnings += doubts
         if not is_seen:
             # Stage 1 then fails, and with it the run: nothing that follows is reached.
             stages = _stopped(STAGES, SEEN_HAND)
@@ -169,15 +169,15 @@ def depth_scale_problems(sequence: Sequence) -> list[Problem]:
     """
     detected = named_fields(sequence.provenance.get(MEASURED_PALMS)) or {}
     scales = named_fields(sequence.provenance.get("depth_scale")) or {}
-    found: list[Problem] = []
+    problems: list[Problem] = []
     for view in sequence.views if sequence.metric else ():
         if not view.has_depth:
             continue
         keypoint = view.keypoint
-        told: Any = detected.get(view.name) if keypoint is None else palm_length(view, keypoint)
-        if isinstance(told, float) and told > 0 and is_impossible_palm(told):
-            found.append(_wrong_scale(view, told, scales.get(view.name)))
-    return found
+        palm: Any = detected.get(view.name) if keypoint is None else palm_length(view, keypoint)
+        if isinstance(palm, float) and palm > 0 and is_impossible_palm(palm):
+            problems.append(_wrong_scale(view, palm, scales.get(view.name)))
+    return problems
 
 
 def _wrong_scale(view: View, length: float, scale: Any) -> Problem:
@@ -260,10 +260,10 @@ def _judge_hands(sequence: Sequence) -> tuple[list[Problem], bool]:
     stored = [view.keypoint for view in views]
     by_view = shows_palm(np.stack([one for one in stored if one is not None]))
     is_shown = np.logical_or.reduce(by_view, axis=0)
-    found: list[Problem] = []
+    problems: list[Problem] = []
     for hand, side in enumerate(sequence.hands):
         if not is_shown[:, hand].any():
-            found.append(
+            problems.append(
                 Problem(
                     level="warning",
                     message=f"No frame of any view shows the {side} hand: it will be left out.",
@@ -280,8 +280,8 @@ def _judge_hands(sequence: Sequence) -> tuple[list[Problem], bool]:
             field=f"hand {hand}",
             remedy="check the keypoints there, or cut these frames out",
         )
-        found += _in_rows(problem, ~is_shown[:, hand])
-    return found, bool(is_shown.any())
+        problems += _in_rows(problem, ~is_shown[:, hand])
+    return problems, bool(is_shown.any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +305,7 @@ def _shown_pixels(sequence: Sequence, views: list[View], progress: Progress) -> 
 
 
 def _judge_masks(sequence: Sequence, shown: _Shown) -> list[Problem]:
-    found: list[Problem] = []
+    problems: list[Problem] = []
     file = "views/*/mask"
     if sequence.missing("marker"):
         seen, labelled = shown.with_depth[OBJECT_LABEL], shown.all_of_them[OBJECT_LABEL]
@@ -316,7 +316,7 @@ def _judge_masks(sequence: Sequence, shown: _Shown) -> list[Problem]:
             field=f"label {OBJECT_LABEL}",
             remedy="label the object (1) in at least one view with depth",
         )
-        found += _in_rows(unseen, seen < FEW_PIXELS)
+        problems += _in_rows(unseen, seen < FEW_PIXELS)
         lost = Problem(
             level="warning",
             message="More than half of the object's pixels have no depth in {frames}.",
@@ -324,11 +324,11 @@ def _judge_masks(sequence: Sequence, shown: _Shown) -> list[Problem]:
             remedy="check depth there: glossy, dark or near surfaces are not measured",
         )
         is_poor = (seen >= FEW_PIXELS) & (seen < (1 - MUCH_LOST) * labelled)
-        found += _in_rows(lost, is_poor)
+        problems += _in_rows(lost, is_poor)
     for side in sequence.hands:
         label = HAND_LABEL[side]
         if (shown.with_depth[label] < FEW_PIXELS).all():
-            found.append(
+            problems.append(
                 Problem(
                     level="warning",
                     message=f"No mask labels the {side} hand: depth cannot tell how far it is.",
@@ -337,7 +337,7 @@ def _judge_masks(sequence: Sequence, shown: _Shown) -> list[Problem]:
                     remedy=f"label the {side} hand ({label}) in the masks of a view with depth",
                 )
             )
-    return found
+    return problems
 
 
 def _judge_tracks(sequence: Sequence) -> list[Problem]:

@@ -50,7 +50,7 @@ _TELLS = 0.2
 
 @dataclass(frozen=True, eq=False)
 class SeenHand:
-    """What all views see of one hand."""
+    """Keypoints of one hand in all views, and the cameras of these."""
 
     cameras: Many[PinholeCamera]
     """Camera of each view."""
@@ -78,14 +78,14 @@ class SeenHand:
 
 @dataclass(frozen=True, eq=False)
 class PairOfViews:
-    """What two views say together about one hand."""
+    """Triangulation of one hand by two views."""
 
     views: tuple[int, int]
     """Their numbers."""
     distance: Float[ndarray, "view frame 21"]
     """From each view's keypoint to what this pair triangulates, as a share of the hand's size."""
     cost: Float[ndarray, "frame 21"]
-    """What that costs over all views; NaN where the pair triangulates nothing."""
+    """Cost over all views; NaN where the pair triangulates nothing."""
     bone_error: Float[ndarray, " frame"]
     """Median error of the bones' lengths, as a logarithm; NaN where too few are known."""
 
@@ -267,8 +267,8 @@ def _bone_error(ratio: Float[ndarray, "frame bone"]) -> Float[ndarray, " frame"]
     """Take the median of how far logarithms of lengths are from being all alike."""
     error = np.full(len(ratio), np.nan)
     is_known = np.isfinite(ratio).sum(1) >= len(_BONES) // 2
-    known = ratio[is_known]
-    away = np.abs(known - np.nanmedian(known, axis=1, keepdims=True))
+    measured = ratio[is_known]
+    away = np.abs(measured - np.nanmedian(measured, axis=1, keepdims=True))
     error[is_known] = np.nanmedian(away, axis=1)
     return error
 

@@ -1,4 +1,4 @@
-"""What is seen of one hand: keypoints, measured points, and space that nothing fills."""
+"""Observation of one hand: keypoints, measured points, and empty space."""
 
 from collections.abc import Sequence as Many
 from dataclasses import dataclass

@@ -51,7 +51,7 @@ _MOST_COST = 50.0
 
 @dataclass(frozen=True, eq=False)
 class SearchedHand:
-    """What a search needs to know of one hand."""
+    """Inputs of the search for one hand."""
 
     cameras: Many[PinholeCamera]
     """Camera of each view."""
@@ -70,7 +70,7 @@ class SearchedHand:
 
 
 def search_hand(
-    hand: SearchedHand, config: HandFitConfig, told: Callable[[int, Tensor], None]
+    hand: SearchedHand, config: HandFitConfig, report: Callable[[int, Tensor], None]
 ) -> dict[str, Tensor]:
     """Fit a hand from several starts in every tenth of a second, and choose a chain of the ends.
 
@@ -80,7 +80,7 @@ def search_hand(
     Args:
         hand: What is seen of the hand, and the first guess.
         config: Settings of the fit; `search_iterations` updates are made.
-        told: Receives the number of each update and its loss, summed over starts.
+        report: Receives the number of each update and its loss, summed over starts.
 
     Returns:
         Shape of the hand; articulation, rotation (as a quaternion) and translation of all frames.
@@ -89,7 +89,7 @@ def search_hand(
     frames = _searched_frames(hand.guess.is_known, hand.frame_rate)
     starts = _Starts(hand, frames, config)
     for iteration in range(config.search_iterations):
-        told(iteration + 1, starts.update(iteration))
+        report(iteration + 1, starts.update(iteration))
     cost, keypoint = starts.outcome()
     chosen = cheapest_chain(cost, keypoint, np.diff(frames) / hand.frame_rate)
     rows = torch.from_numpy(np.arange(len(frames)) * cost.shape[1] + chosen)
@@ -113,9 +113,9 @@ def search_hand(
 
 def _searched_frames(is_known: Bool[ndarray, " frame"], frame_rate: float) -> Int[ndarray, " some"]:
     """Choose frames in which the palm was seen, about `_GAP` apart."""
-    known = np.flatnonzero(is_known)
-    wanted = np.arange(known[0], known[-1] + 1, max(1, round(_GAP * frame_rate)))
-    return np.unique(known[np.abs(known - wanted[:, None]).argmin(axis=1)])
+    seen = np.flatnonzero(is_known)
+    wanted = np.arange(seen[0], seen[-1] + 1, max(1, round(_GAP * frame_rate)))
+    return np.unique(seen[np.abs(seen - wanted[:, None]).argmin(axis=1)])
 
 
 class _Starts:

@@ -51,7 +51,7 @@ def freedom_left(frame_count: int, strength: float) -> float:
 
 def smoothed_pose(parameters: Mapping[str, Tensor], strength: float) -> dict[str, Tensor]:
     """Smooth ``articulation``, ``rotation`` (a quaternion) and ``translation`` of a hand."""
-    found: dict[str, Tensor] = {}
+    pose: dict[str, Tensor] = {}
     for name in ("articulation", "rotation", "translation"):
         value = parameters[name].detach().double().numpy()
         if name == "rotation":
@@ -59,8 +59,8 @@ def smoothed_pose(parameters: Mapping[str, Tensor], strength: float) -> dict[str
         value = smoothed(value, strength)
         if name == "rotation":
             value = value / np.linalg.norm(value, axis=-1, keepdims=True)
-        found[name] = torch.from_numpy(value.astype(np.float32))
-    return found
+        pose[name] = torch.from_numpy(value.astype(np.float32))
+    return pose
 
 
 def best_strength(

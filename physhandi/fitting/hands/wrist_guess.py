@@ -209,13 +209,13 @@ def way_to_depth(
     It is the median of `ways_to_depth` over a short time; frames without one are interpolated.
     """
     way = ways_to_depth(vertex, normal, target)
-    known = np.flatnonzero(np.isfinite(way[:, 0]))
-    if not len(known):
+    measured = np.flatnonzero(np.isfinite(way[:, 0]))
+    if not len(measured):
         return np.zeros((len(vertex), 3))
-    window = min(len(known), 2 * round(_STEADY * frame_rate / 2) + 1)
-    steady = median_filter(way[known], size=(window, 1), mode="nearest")
+    window = min(len(measured), 2 * round(_STEADY * frame_rate / 2) + 1)
+    steady = median_filter(way[measured], size=(window, 1), mode="nearest")
     frames = np.arange(len(vertex))
-    return np.stack([np.interp(frames, known, steady[:, axis]) for axis in range(3)], axis=1)
+    return np.stack([np.interp(frames, measured, steady[:, axis]) for axis in range(3)], axis=1)
 
 
 def ways_to_depth(

@@ -1,1 +1,1 @@
-"""What is told of the object from what was seen of it: places of its tracks, and its state."""
+"""Estimates from the observation of an object: places of its tracks, and its state."""

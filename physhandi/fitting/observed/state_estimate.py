@@ -123,7 +123,7 @@ def _smoothed(
     """
     tree: Any = KDTree(place)
     count = min(MOST_TRACKS_AROUND, len(place))
-    distance, near = (np.reshape(found, (-1, count)) for found in tree.query(node, k=count))
+    distance, near = (np.reshape(each, (-1, count)) for each in tree.query(node, k=count))
     apart = 0.5 * distance[:, min(CARRIERS, count) - 1]
     weight = np.exp(-0.5 * (distance / np.maximum(width, apart)[:, None]) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)

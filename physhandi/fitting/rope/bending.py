@@ -1,4 +1,4 @@
-"""What is fitted of a rope that bends, and the model that follows from it."""
+"""Fitted parameters of a rope that bends, and the model that follows from them."""
 
 from dataclasses import dataclass, replace
 
@@ -30,7 +30,7 @@ LOGARITHMS = ("stiffness", "damping", "drag", "twist_stiffness")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bending:
-    """What is fitted: the same rope in all sequences."""
+    """Fitted parameters of a rope, the same in all sequences."""
 
     stiffness: float
     """Bending stiffness EI by the mass of a metre [m⁴/s²]."""

@@ -133,22 +133,22 @@ def fit_rope(
 
     checkpointer = checkpointer or Checkpointer()
     resumed = checkpointer.load(SPRING_STAGE, state(), growing=("curve",))
-    first, kept = 0, None
+    first, stored_step = 0, None
     if resumed is not None:
         tensors = resumed.tensors
         first, made, is_last = tensors["place"].tolist()
-        kept = RopeStep(
+        stored_step = RopeStep(
             vector=tensors["vector"],
             levenberg=float(tensors["levenberg"][0]),
             made=made,
             is_last=bool(is_last),
         )
-        bending, best = Bending.from_vector(kept.vector), Bending.from_array(tensors["best"])
+        bending, best = Bending.from_vector(stored_step.vector), Bending.from_array(tensors["best"])
         loss, curve = float(tensors["loss"][0]), tensors["curve"].tolist()
         done = resumed.iteration
         progress.report(SPRING_STAGE, done, 2 * count, curve[-1][1], resumed_note(done))
     for number in range(first, 2):
-        for step in fit.steps(bending, (WINDOW, None)[number], count, kept):
+        for step in fit.steps(bending, (WINDOW, None)[number], count, stored_step):
             bending = Bending.from_vector(step.vector)
             now = fit.loss(bending)
             curve.append([float(len(curve)), now])
@@ -156,7 +156,7 @@ def fit_rope(
                 best, loss = bending, now
             checkpointer.offer(SPRING_STAGE, len(curve) - 1, state)
             progress.report(SPRING_STAGE, len(curve) - 1, 2 * count, now)
-        kept = None
+        stored_step = None
     return FirstOrderResult(
         models=fit.models(best),
         parameters=fit.parameters.replace(drag=best.drag),
@@ -224,10 +224,10 @@ class RopeFit:
 
     def likely(self) -> tuple[Bending, float]:
         """Give the rope that the balance of moments found, or the straight one, and its loss."""
-        found = [each for each in (self.balanced, self.straight) if each is not None]
-        losses = [self.loss(each) for each in found]
+        candidates = [each for each in (self.balanced, self.straight) if each is not None]
+        losses = [self.loss(each) for each in candidates]
         index = int(np.argmin(losses))
-        return found[index], losses[index]
+        return candidates[index], losses[index]
 
     def models(self, bending: Bending) -> dict[str, SpringMassModel]:
         """Build the model of each sequence."""
@@ -243,7 +243,7 @@ class RopeFit:
         return loss
 
     def steps(
-        self, start: Bending, window: float | None, most: int, kept: RopeStep | None = None
+        self, start: Bending, window: float | None, most: int, stored_step: RopeStep | None = None
     ) -> Iterator[RopeStep]:
         """Make Levenberg-Marquardt steps that lower the cost of `_errors`.
 
@@ -251,12 +251,12 @@ class RopeFit:
             start: Where to begin.
             window: Time over which rollouts follow from an observed state; None for whole ones [s].
             most: Number of steps.
-            kept: Step after which to go on; None for the first one.
+            stored_step: Step after which to go on; None for the first one.
 
         Yields:
             Each step; it ends where steps gain next to nothing.
         """
-        step = kept or RopeStep(vector=start.to_vector(), levenberg=FIRST_LEVENBERG)
+        step = stored_step or RopeStep(vector=start.to_vector(), levenberg=FIRST_LEVENBERG)
         if step.is_last:
             return
         vector, levenberg = step.vector, step.levenberg

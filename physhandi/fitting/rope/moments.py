@@ -108,15 +108,18 @@ def _moment_equations(
     unit = np.eye(3)
     free = [about_axes(np.broadcast_to(each, edge.shape)) for each in unit]
     free += [axes[..., coordinate].reshape(len(node), -1) for coordinate in range(3)]
-    known = [(curvature / length).reshape(len(node), -1), (change / length).reshape(len(node), -1)]
-    known.append(-about_axes(along(velocity)))
-    rest = -np.eye(known[0].shape[1])
+    columns = [
+        (curvature / length).reshape(len(node), -1),
+        (change / length).reshape(len(node), -1),
+    ]
+    columns.append(-about_axes(along(velocity)))
+    rest = -np.eye(columns[0].shape[1])
     loads = about_axes(along(acceleration))
     equations = []
     for frame in range(EDGE_FRAMES, len(node) - EDGE_FRAMES):
         gripper = np.stack([each[frame] for each in free], axis=1)
         across = np.linalg.qr(gripper, mode="complete")[0][:, gripper.shape[1] :].T
-        row = np.concatenate([np.stack([each[frame] for each in known], axis=1), rest], axis=1)
+        row = np.concatenate([np.stack([each[frame] for each in columns], axis=1), rest], axis=1)
         equations.append((across @ row, across @ loads[frame]))
     return equations
 

@@ -66,11 +66,11 @@ class GroupBlocks:
     first: Int[ndarray, " bin"]
     """First half-edge by row, by whether a candidate may lack it, and by banks."""
     count: Int[ndarray, " bin"]
-    """How many there are."""
+    """Number of these half-edges."""
     place: Int[ndarray, " half_edge"]
     """Bytes to the other end in shared memory, and from bit 16 on the candidates that lack it."""
     spring: Int[ndarray, " half_edge"]
-    """Which spring it is."""
+    """Number of its spring."""
 
     @property
     def most_halo(self) -> int:

@@ -71,7 +71,7 @@ class HalfEdgeColumns:
     place: Int32[ndarray, " slot"]
     """Place of the other end in the block's part of `local_node`; padding ends where it begins."""
     spring: Int32[ndarray, " slot"]
-    """Which spring it is; -1 for padding."""
+    """Number of its spring; -1 for padding."""
 
 
 def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeColumns:
@@ -121,7 +121,7 @@ class LargeLayout:
 
     lanes: int
     """Threads that sum one node's springs."""
-    kept: int
+    in_registers: int
     """Half-edges that each of them keeps in registers."""
     threads: int
     """Threads of a block."""
@@ -141,9 +141,9 @@ class LargeLayout:
             (n for n in LANES_PER_NODE if own * n <= max(LARGE_BLOCK_SIZES)), LANES_PER_NODE[-1]
         )
         threads = next((n for n in LARGE_BLOCK_SIZES if own * lanes <= n), max(LARGE_BLOCK_SIZES))
-        kept = max(1, min(LARGE_BLOCK_SIZES[threads], -(-partition.most_entries // lanes)))
+        in_registers = max(1, min(LARGE_BLOCK_SIZES[threads], -(-partition.most_entries // lanes)))
         steps = -(-partition.most_locals // LOCALS_STEP)
-        return cls(lanes, kept, threads, min(steps * LOCALS_STEP, most_locals))
+        return cls(lanes, in_registers, threads, min(steps * LOCALS_STEP, most_locals))
 
 
 class LargeFrames:
@@ -161,7 +161,7 @@ class LargeFrames:
         self._block_count = partition.block_count
         self.layout = LargeLayout.of(partition, most_large_locals(simulator.device))
         if few_kernels:
-            self.layout = replace(self.layout, kept=MOST_KEPT)
+            self.layout = replace(self.layout, in_registers=MOST_KEPT)
         columns = arrange_columns(partition, self.layout.lanes, self.layout.threads)
         self._chunk_count = columns.chunk_count
         self._start = simulator.array(columns.start, wp.int32)
@@ -200,7 +200,7 @@ class LargeFrames:
         body, *places = blocks
         inputs += [simulator.world, body, simulator.clearance, *places, self._start, self._packed]
         wp.launch(
-            large_frame_kernel(layout.lanes, layout.kept, layout.threads, layout.locals),
+            large_frame_kernel(layout.lanes, layout.in_registers, layout.threads, layout.locals),
             dim=self._block_count * layout.threads,
             inputs=[*inputs, *simulator.controls, *before],
             outputs=[relay, *after, simulator.first_divergence],
@@ -215,7 +215,7 @@ class BlockLayout:
 
     lanes: int
     """Threads that sum one node's springs."""
-    kept: int
+    in_registers: int
     """Half-edges that each of them keeps in registers."""
     threads: int
     """Threads of a block."""
@@ -225,14 +225,16 @@ class BlockLayout:
         """Choose by measurement (docs/benchmarks): many lanes, but few idle threads."""
         wide = (n for n in (32, 16) if partition.most_own * n <= MOST_LANES)
         lanes = next((n for n in wide if n < 2 * partition.most_entries), 8)
-        kept = max(1, min(MOST_KEPT, -(-partition.most_entries // lanes)))
+        in_registers = max(1, min(MOST_KEPT, -(-partition.most_entries // lanes)))
         needed = partition.most_own * lanes
-        return cls(lanes, kept, next((n for n in BLOCK_SIZES if n >= needed), BLOCK_SIZES[-1]))
+        return cls(
+            lanes, in_registers, next((n for n in BLOCK_SIZES if n >= needed), BLOCK_SIZES[-1])
+        )
 
     def holds(self, partition: Partition) -> bool:
         """Tell whether every node has its own threads, and every half-edge a register."""
         has_threads = partition.most_own * self.lanes <= self.threads
-        return has_threads and partition.most_entries <= self.lanes * self.kept
+        return has_threads and partition.most_entries <= self.lanes * self.in_registers
 
 
 class Relay:
@@ -279,7 +281,9 @@ class CudaEngine:
         self.layout = layout = BlockLayout.of(partition)
         has_many = body_of is not None
         if has_many:
-            self.layout = replace(layout, kept=layout.kept + layout.kept % 2)
+            self.layout = replace(
+                layout, in_registers=layout.in_registers + layout.in_registers % 2
+            )
         names = ("own_start", "local_start", "local_node", "model_node", "entry_start")
         self._map = [simulator.array(getattr(partition, name), wp.int32) for name in names]
         self._map.append(simulator.array(partition.entry, wp.vec2i))
@@ -334,7 +338,7 @@ class CudaEngine:
             self.large.advance([self._body, *self._map[:4]], self._relay.value, tag, before, after)
             return
         self._launch(
-            frame_kernel(self.layout.lanes, self.layout.kept),
+            frame_kernel(self.layout.lanes, self.layout.in_registers),
             [self.layout.threads, substeps, self._relay.next_tags(substeps + 1), simulator.world],
             [self._body, simulator.clearance, *self._map, *simulator.material],
             [*simulator.controls, *before],
@@ -366,7 +370,7 @@ class CudaEngine:
         simulator = self._simulator
         substeps = simulator.parameters.substeps_per_frame
         self._launch(
-            adjoint_kernel(self.layout.lanes, self.layout.kept),
+            adjoint_kernel(self.layout.lanes, self.layout.in_registers),
             [self.layout.threads, substeps, self._relay.next_tags(substeps), simulator.world],
             [simulator.clearance, *self._map, is_first, object_spring_count],
             [*simulator.material, *simulator.controls, tape],

@@ -65,8 +65,8 @@ class GraphAdjoint:
         self._fill.replay(simulator.find_candidates(self._position[0]))
         for rows, value in zip((self._position, self._velocity), state, strict=True):
             wp.copy(value, rows[-1])
-        for kept, own in zip(tape, self._tape, strict=True):
-            wp.copy(kept, own)
+        for stored, own in zip(tape, self._tape, strict=True):
+            wp.copy(stored, own)
         self._copied = tape
 
     def backward(self, tape: Tape) -> None:
@@ -76,8 +76,8 @@ class GraphAdjoint:
         written to `sums`.
         """
         if tape is not self._copied:
-            for kept, own in zip(tape, self._tape, strict=True):
-                wp.copy(own, kept)
+            for stored, own in zip(tape, self._tape, strict=True):
+                wp.copy(own, stored)
             self._copied = tape
         for value in self.sums:
             value.zero_()

@@ -10,7 +10,7 @@ from physhandi.simulation.parameters import SimulationParameters
 
 
 class FrameHost(Protocol):
-    """What advances by frames of a CUDA engine: a simulator, or several bodies side by side."""
+    """Simulation by frames of a CUDA engine: a simulator, or several bodies side by side."""
 
     parameters: SimulationParameters
     device: Any

@@ -73,9 +73,9 @@ class MasterHalfEdges:
         Args:
             exists: The springs that it has.
         """
-        kept = np.flatnonzero(exists[self._spring])
-        source, other, block = self._source[kept], self._other[kept], self._block[kept]
-        beyond, pair = self._is_beyond[kept], self._pair[kept]
+        present = np.flatnonzero(exists[self._spring])
+        source, other, block = self._source[present], self._other[present], self._block[present]
+        beyond, pair = self._is_beyond[present], self._pair[present]
         used = np.zeros(len(self._halo_block), dtype=bool)
         used[pair[beyond]] = True
         blocks = len(self.own_start) - 1
@@ -99,8 +99,8 @@ class MasterHalfEdges:
             local_start=local_start.astype(np.int32),
             local_node=local_node.astype(np.int32),
             entry_start=np.searchsorted(source, np.arange(self._count + 1)).astype(np.int32),
-            entry=np.stack([local, number[self._spring[kept]]], axis=1).astype(np.int32),
-            is_first=np.zeros(len(kept), dtype=np.int32),
+            entry=np.stack([local, number[self._spring[present]]], axis=1).astype(np.int32),
+            is_first=np.zeros(len(present), dtype=np.int32),
         )
 
 

@@ -348,7 +348,7 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
         """Write a coordinate of a node and candidate to shared memory."""
 
     @wp.func_native(snippet=native(_KEPT))
-    def kept(parity: int, number: int, place: int) -> float:
+    def kept_value(parity: int, number: int, place: int) -> float:
         """Read a coordinate of a node and candidate from shared memory."""
 
     @wp.func_native(snippet=native(_KEEP_PAIR))
@@ -621,7 +621,7 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
             node = kept_node(i // wp.static(GROUP_WIDTH)) // 2
             at = wp.static(6 * GROUP_WIDTH) * (group * nodes + node) + i % wp.static(GROUP_WIDTH)
             for k in range(6):
-                state_out[at + wp.static(GROUP_WIDTH) * k] = kept(substeps % 2, k, i)
+                state_out[at + wp.static(GROUP_WIDTH) * k] = kept_value(substeps % 2, k, i)
 
     return advance_batch_frame
 

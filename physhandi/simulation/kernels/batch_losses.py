@@ -1,4 +1,4 @@
-"""How far the motion of each of many candidates is from what was observed, frame by frame.
+"""Distance of the motion of each of many candidates from the observation, frame by frame.
 
 Every thread adds up a few terms of one candidate; neighbouring threads are candidates, whose
 states lie side by side (see `kernels.batch`). Sums have a fixed order.

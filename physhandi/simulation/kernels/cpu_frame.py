@@ -113,8 +113,8 @@ def move_nodes(
         if free_tape.shape[0] > 0:
             free_tape[substep, node] = wp.vec4(free[0], free[1], free[2], 0.0)
         if is_too_fast(motion.velocity):
-            found = substep * count + parts.node[node]
-            first_divergence[part] = wp.min(first_divergence[part], found)
+            place = substep * count + parts.node[node]
+            first_divergence[part] = wp.min(first_divergence[part], place)
 
 
 @wp.kernel

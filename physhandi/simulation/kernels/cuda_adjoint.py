@@ -28,7 +28,7 @@ ADJOINT_LOCALS = 448
 
 @wp.struct
 class SpringAdjoint:
-    """What one spring says of its offset, its stretch, its stiffness and its damping."""
+    """Adjoints of the offset, stretch, stiffness and damping of one spring."""
 
     offset: wp.vec3
     stretch: wp.vec3
@@ -95,15 +95,15 @@ def tape_item(
     return 3 * node + part
 
 
-def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
+def make_adjoint_kernel(lanes: int, in_registers: int) -> wp.Kernel:
     """Make the kernel that walks one frame back.
 
     Args:
         lanes: Threads that sum one node's springs: 8, 16 or 32.
-        kept: Half-edges that each thread keeps in registers; there must be no more.
+        in_registers: Half-edges that each thread keeps in registers; there must be no more.
     """
-    kept_float = wp.types.vector(length=kept, dtype=wp.float32)
-    load_half_edges = make_loader(lanes, kept)
+    kept_float = wp.types.vector(length=in_registers, dtype=wp.float32)
+    load_half_edges = make_loader(lanes, in_registers)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=768)
     def frame_adjoint(
@@ -243,7 +243,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
             force_bar = shared_read(now + 2 * wp.static(ADJOINT_LOCALS) + n)
             place_bar = wp.vec3(0.0, 0.0, 0.0)
             speed_bar = wp.vec3(0.0, 0.0, 0.0)
-            for k in range(wp.static(kept)):
+            for k in range(wp.static(in_registers)):
                 if index[k] >= 0:
                     offset = shared_read(now + index[k]) - x
                     stretch = shared_read(now + wp.static(ADJOINT_LOCALS) + index[k]) - v
@@ -275,7 +275,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
             drag_bar_out[node] = drag_bar
             restitution_bar_out[node] = restitution_bar
             friction_bar_out[node] = friction_bar
-        for k in range(wp.static(kept)):
+        for k in range(wp.static(in_registers)):
             e = entry_first + lane + wp.static(lanes) * k
             if index[k] >= 0 and is_first[e] == 1:
                 log_stiffness_bar_out[spring[k]] = log_stiffness_bar[k]

@@ -69,14 +69,14 @@ def control_velocity(
     return rate * (control_end[control] - control_start[control])
 
 
-def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
+def make_frame_kernel(lanes: int, in_registers: int) -> wp.Kernel:
     """Make the kernel that advances one frame.
 
     Args:
         lanes: Threads that sum one node's springs: 8, 16 or 32.
-        kept: Half-edges that each thread keeps in registers; more are read every substep.
+        in_registers: Half-edges that each thread keeps in registers; more are read every substep.
     """
-    load_half_edges = make_loader(lanes, kept)
+    load_half_edges = make_loader(lanes, in_registers)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=1024)
     def advance_frame(
@@ -173,10 +173,10 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
                 x = shared_read(now + n)
                 v = shared_read(now + wp.static(FORWARD_LOCALS) + n)
                 force = wp.vec3(0.0, 0.0, 0.0)
-                begin = entry_first + wp.static(lanes * kept)
+                begin = entry_first + wp.static(lanes * in_registers)
                 end = entry_last
                 if from_row == 0:
-                    for k in range(wp.static(kept)):
+                    for k in range(wp.static(in_registers)):
                         if index[k] >= 0:
                             offset = shared_read(now + index[k]) - x
                             stretch = shared_read(now + wp.static(FORWARD_LOCALS) + index[k]) - v

@@ -52,17 +52,17 @@ def pack_half_edges(
         packed_out[slot] = wp.vec4(other, r, hooke, damping[s])
 
 
-def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -> wp.Kernel:
+def make_large_frame_kernel(lanes: int, in_registers: int, threads: int, locals_: int) -> wp.Kernel:
     """Make the kernel that advances one frame.
 
     Args:
         lanes: Threads that sum one node's springs: 1, 2, 4 or 8.
-        kept: Half-edges that each thread keeps in registers; more are read every substep.
+        in_registers: Half-edges that each thread keeps in registers; more are read every substep.
         threads: Of a block.
         locals_: Nodes, its own and its halo, that a block has room for.
     """
-    kept_float = wp.types.vector(length=kept, dtype=wp.float32)
-    kept_int = wp.types.vector(length=kept, dtype=wp.int32)
+    kept_float = wp.types.vector(length=in_registers, dtype=wp.float32)
+    kept_int = wp.types.vector(length=in_registers, dtype=wp.int32)
     room = FLOATS_OF_A_LOCAL * locals_
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=threads)
@@ -117,7 +117,7 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
         dashpot = kept_float()
         kept_first = slot_start[group]
         kept_last = slot_start[group + 1]
-        for k in range(wp.static(kept)):
+        for k in range(wp.static(in_registers)):
             index[k] = wp.min(row, own - 1)
             if kept_first + 32 * k < kept_last:
                 half_edge = read_four(packed, kept_first + 32 * k + warp_lane)
@@ -165,8 +165,8 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
                 begin = slot_start[columns]
                 end = slot_start[columns + 1]
                 if chunk == 0:
-                    begin = begin + wp.static(32 * kept)
-                    for k in range(wp.static(kept)):
+                    begin = begin + wp.static(32 * in_registers)
+                    for k in range(wp.static(in_registers)):
                         offset = large_read(now + index[k]) - x
                         stretch = large_read(now + wp.static(locals_) + index[k]) - v
                         force += pull(offset, stretch, rest[k], hooke[k], dashpot[k])

@@ -18,15 +18,15 @@ def entries_of(row: int, own: int, first: int, entry_start: wp.array[int]):
     return begin, end
 
 
-def make_loader(lanes: int, kept: int) -> wp.Function:
+def make_loader(lanes: int, in_registers: int) -> wp.Function:
     """Make the function that loads a thread's half-edges.
 
     Args:
         lanes: Threads that sum one node's springs.
-        kept: Half-edges that each thread keeps.
+        in_registers: Half-edges that each thread keeps.
     """
-    kept_float = wp.types.vector(length=kept, dtype=wp.float32)
-    kept_int = wp.types.vector(length=kept, dtype=wp.int32)
+    kept_float = wp.types.vector(length=in_registers, dtype=wp.float32)
+    kept_int = wp.types.vector(length=in_registers, dtype=wp.int32)
 
     @wp.func
     def load_half_edges(
@@ -45,7 +45,7 @@ def make_loader(lanes: int, kept: int) -> wp.Function:
         rest = kept_float()
         hooke = kept_float()
         dashpot = kept_float()
-        for k in range(wp.static(kept)):
+        for k in range(wp.static(in_registers)):
             e = entry_first + lane + wp.static(lanes) * k
             other[k] = -1
             if e < entry_last:

@@ -1,4 +1,4 @@
-"""What CUDA offers within and between thread blocks and Warp does not; nothing of it on a CPU."""
+"""CUDA operations within and between thread blocks that Warp lacks; none of them runs on a CPU."""
 
 import warp as wp
 
@@ -163,8 +163,8 @@ def shared(slot: int, value: wp.vec4, is_write: bool) -> wp.vec4:
 @wp.func
 def shared_read(slot: int):
     """Read a vector from the block's shared memory."""
-    found = shared(slot, wp.vec4(0.0, 0.0, 0.0, 0.0), False)
-    return wp.vec3(found[0], found[1], found[2])
+    value = shared(slot, wp.vec4(0.0, 0.0, 0.0, 0.0), False)
+    return wp.vec3(value[0], value[1], value[2])
 
 
 @wp.func

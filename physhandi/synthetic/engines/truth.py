@@ -35,7 +35,7 @@ class MovingHand(Protocol):
 
     @property
     def side(self) -> Side:
-        """Which hand moves."""
+        """Side of the hand that moves."""
         ...
 
     @property

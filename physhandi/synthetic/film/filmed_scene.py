@@ -33,7 +33,7 @@ class FilmedHand:
     """The surface of one hand over time."""
 
     side: Side
-    """Which hand."""
+    """Side of the hand."""
     vertex: Float[ndarray, "frame vertex 3"]
     """Vertices [m]."""
     faces: Int[ndarray, "face 3"]

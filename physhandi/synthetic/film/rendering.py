@@ -59,13 +59,13 @@ class Scene:
     faces: Int[ndarray, "face 3"]
     """Triangles of the body, then of the hands."""
     face_label: UInt8[ndarray, " face"]
-    """What each triangle belongs to, as masks name it: 1 the body, 2 and 3 the hands."""
+    """Mask label of each triangle: 1 the body, 2 and 3 the hands."""
     pattern: Float[ndarray, "vertex 2"]
     """Where each vertex lies on the body's pattern [m]; unused for hands."""
     dye: Dye = field(default_factory=Dye)
     """Colors of the body."""
     light: PinholeCamera = field(default_factory=light_camera)
-    """What the light sees; see `light_camera`."""
+    """Camera of the light; see `light_camera`."""
     device: str = "cpu"
     """Warp device that draws it."""
 
@@ -84,7 +84,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a perfect camera sees."""
+    """Image of a perfect camera."""
 
     depth: Float[ndarray, "row column"]
     """Depth of the nearest surface, the table included [m]; 0 above the horizon."""

@@ -80,7 +80,7 @@ class TrueHand:
     """Linear blend skinning of MakeHuman's hand of 16 bones."""
 
     side: Side
-    """Which hand this is."""
+    """Side of the hand."""
     rest_vertex: Float[ndarray, "vertex 3"]
     """Surface in the rest pose [m]."""
     faces: Int[ndarray, "face 3"]

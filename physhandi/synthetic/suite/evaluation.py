@@ -49,7 +49,7 @@ _SCORES = "synthetic/suite/folder.py"
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What to evaluate: sequences, methods and protocols."""
+    """Order of an evaluation: sequences, methods and protocols."""
 
     title: str
     """Title of the report."""

@@ -175,7 +175,7 @@ class SuiteFolder:
 
 
 class StoredAbout(TypedDict):
-    """What ``cells.json`` says of the order, as far as it is read again."""
+    """Order of the suite in ``cells.json``, as far as it is read again."""
 
     title: str
     methods: dict[str, str]

@@ -55,7 +55,7 @@ CORRECTIONS: dict[str, str] = {
     "last_residual": "The last residual is added.",
     "restart": "Prediction starts from the observed state.",
 }
-"""What can be done to the predicted frames of a method; ends its name."""
+"""Corrections of the predicted frames of a method; ends its name."""
 _NAME = re.compile(
     r"(?P<base>[^@+]*)(@(?P<settings>.*?))?(\+(?P<correction>[A-Za-z]\w*))?", re.DOTALL
 )
@@ -81,7 +81,7 @@ class Method:
     overrides: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings that differ from the profile's."""
     correction: str | None = None
-    """What is done to the predicted frames, one of `CORRECTIONS`; None leaves them."""
+    """Correction of the predicted frames, one of `CORRECTIONS`; None leaves them."""
     seed_of: str = ""
     """The method that this is one of several seeds of; empty if there are not several."""
 
@@ -147,8 +147,8 @@ def parse_method(text: str) -> Method:
     if base not in METHODS:
         raise UsageError(f"There is no method '{base}'. Choose from: {', '.join(METHODS)}.")
     if correction is not None and correction not in CORRECTIONS:
-        known = " and ".join(f"'+{name}'" for name in CORRECTIONS)
-        raise UsageError(f"Method '{text}' ends in '+{correction}'; only {known} exist.")
+        names = " and ".join(f"'+{name}'" for name in CORRECTIONS)
+        raise UsageError(f"Method '{text}' ends in '+{correction}'; only {names} exist.")
     overrides: dict[str, Any] = {}
     for part in () if settings is None else _split(settings):
         path, equals, value = part.partition("=")
@@ -321,7 +321,7 @@ def execute(
             )
         config = pipeline.PipelineConfig.from_dict(settings)
         if method.rule is None:
-            pipeline.reconstruct([recording], config, attempt, watched, device=device)
+            pipeline.run_reconstruction([recording], config, attempt, watched, device=device)
         else:
             rule = partial(_moved, rule=method.rule, truth=truth)
             pipeline.predict(recording, config, rule, attempt, watched)

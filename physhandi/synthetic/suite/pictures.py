@@ -54,8 +54,8 @@ def motion_picture(
     Raises:
         MissingInputError: If the recording has no true surface or no view.
     """
-    told = read_truth(recording.folder)
-    truth = true_surface(told)
+    stored_truth = read_truth(recording.folder)
+    truth = true_surface(stored_truth)
     if truth is None or not recording.views:
         raise MissingInputError(
             f"Sequence '{recording.name}' tells no true surface or has no view: nothing to draw."
@@ -67,7 +67,7 @@ def motion_picture(
             Surface(vertex=truth.point[f], faces=truth.face, color=_TRUTH, shading=0.5),
             *(
                 Balls(center=vertex[f], radius=np.array([_HAND_POINT]), color=_HAND)
-                for vertex in told.hand_vertex.values()
+                for vertex in stored_truth.hand_vertex.values()
             ),
         ]
         for f in frames

@@ -17,7 +17,7 @@ from app.exports.recorded_film import LARGEST_DIFFERENCE, film_recorded_view, pa
 from app.exports.request import FileRequest
 from app.settings import BUNDLED
 from app.viewer.color.colormaps import table
-from app.viewer.content.content import Content, open_run
+from app.viewer.content.content import Content, open_run_content
 from app.viewer.restoring import complete_state
 from physhandi.errors import UsageError
 
@@ -27,7 +27,7 @@ WHITE = (255, 255, 255)
 
 @pytest.fixture(scope="module")
 def content() -> Content:
-    return open_run(FolderCatalog(BUNDLED), "towel_fold_quick")
+    return open_run_content(FolderCatalog(BUNDLED), "towel_fold_quick")
 
 
 def film(content: Content, out: Path, query: dict[str, str], **options: Any) -> list[np.ndarray]:

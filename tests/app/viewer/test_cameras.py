@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from viewer_world import Recording
 
-from app.viewer.content.content import open_sequence
+from app.viewer.content.content import open_sequence_content
 from app.viewer.scene.cameras import CameraNodes, Lens
 from app.viewer.scene.framing import frame_content
 from physhandi.data.camera import PinholeCamera
@@ -42,7 +42,7 @@ def test_an_image_that_is_straight_stays_as_it_is() -> None:
 def test_a_backdrop_follows_every_frame_and_other_images_now_and_then(
     server, catalog, recording: Recording
 ) -> None:
-    content = open_sequence(catalog, recording.sequence.name)
+    content = open_sequence_content(catalog, recording.sequence.name)
     cameras = CameraNodes(server, content.views, frame_content(content), clock=lambda: 5.0)
 
     def brightness(frame: int, looks_from: str | None) -> list[float]:

@@ -13,7 +13,7 @@ from viewer_world import FolderCatalog
 from app.viewer.color.coloring import Painter
 from app.viewer.color.colormaps import UNKNOWN, levels, paint_values, table
 from app.viewer.color.quantities import QUANTITIES, measure
-from app.viewer.content.content import open_run
+from app.viewer.content.content import open_run_content
 from app.viewer.content.layers import COLORINGS, Layers
 from app.viewer.content.observed import PointSet, Tracks
 
@@ -63,7 +63,7 @@ def test_every_coloring_is_described_and_measured():
 
 
 def test_the_error_of_a_track_is_the_metric_s():
-    content = open_run(FolderCatalog(BUNDLED), "towel_fold_quick")
+    content = open_run_content(FolderCatalog(BUNDLED), "towel_fold_quick")
     name = content.sequence_name
     out = BUNDLED / "runs" / "towel_fold_quick" / "attempts" / "1" / "out" / "sequences" / name
     measured = json.loads((out / "frame_errors.json").read_text())

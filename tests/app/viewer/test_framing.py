@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.viewer.content.content import Content, open_run, open_sequence
+from app.viewer.content.content import Content, open_run_content, open_sequence_content
 from app.viewer.content.layers import default_layers
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.layers_panel import legend_of
@@ -39,7 +39,7 @@ def test_everything_that_moves_is_in_the_picture_at_any_scale(scale: float) -> N
 
 
 def test_the_overview_stands_between_the_recording_cameras(catalog, recording) -> None:
-    framing = frame_content(open_sequence(catalog, recording.sequence.name))
+    framing = frame_content(open_sequence_content(catalog, recording.sequence.name))
     for view in recording.sequence.views:
         eye = view.camera.T_world_camera[:2, 3] - framing.center[:2]
         away = np.angle(np.exp(1j * (np.arctan2(eye[1], eye[0]) - framing.azimuth)))
@@ -47,18 +47,18 @@ def test_the_overview_stands_between_the_recording_cameras(catalog, recording) -
 
 
 def test_a_run_hides_the_recording_at_first_and_a_recording_shows_it(catalog, recording) -> None:
-    of_run = default_layers(open_run(catalog, "sheet"))
-    of_recording = default_layers(open_sequence(catalog, recording.sequence.name))
+    of_run = default_layers(open_run_content(catalog, "sheet"))
+    of_recording = default_layers(open_sequence_content(catalog, recording.sequence.name))
     assert (of_run.observed, of_run.cameras) == (False, False)
     # Springs would hide the surface, and come in its place where there is none.
     assert (of_run.surface, of_run.nodes, of_run.object_springs) == (True, False, False)
-    bare = default_layers(replace(open_run(catalog, "sheet"), surface=None))
+    bare = default_layers(replace(open_run_content(catalog, "sheet"), surface=None))
     assert (bare.surface, bare.nodes, bare.object_springs) == (False, True, True)
     assert (of_recording.observed, of_recording.cameras) == (True, True)
 
 
 def test_the_legend_of_parts_names_what_is_shown_alone(catalog) -> None:
-    content = open_run(catalog, "sheet")
+    content = open_run_content(catalog, "sheet")
     layers = default_layers(content)
 
     def said() -> list[str]:

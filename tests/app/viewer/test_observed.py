@@ -7,7 +7,7 @@ from viewer_world import FolderCatalog
 from app.previews.links import marker_links
 from app.settings import BUNDLED
 from app.viewer.color.coloring import Painter
-from app.viewer.content.content import Content, open_run
+from app.viewer.content.content import Content, open_run_content
 from app.viewer.content.layers import Layers
 from app.viewer.content.observed import BONES, CloudSet, DepthCloud, Markers, lift_keypoints
 from app.viewer.inspect.inspector import clickable
@@ -96,7 +96,7 @@ def test_depth_becomes_points_in_front_of_the_camera(recording) -> None:
 
 
 def test_observed_points_have_the_colors_of_the_video_in_their_own_frame():
-    observed = open_run(FolderCatalog(BUNDLED), "towel_fold_quick").observed
+    observed = open_run_content(FolderCatalog(BUNDLED), "towel_fold_quick").observed
     assert observed.is_colored
     for frame in (0, 40):
         point = observed.points(frame)

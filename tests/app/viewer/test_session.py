@@ -11,7 +11,7 @@ from viewer_world import FRAMES, FakeSettings
 
 from app.exports.permalink import state_from_query
 from app.viewer.compare.live import LiveComparison
-from app.viewer.content.content import open_run
+from app.viewer.content.content import open_run_content
 from app.viewer.content.session_state import Pose
 from app.viewer.export.snapshot import snapshot_csv, snapshot_npz, snapshot_ply, snapshot_yaml
 from app.viewer.restoring import complete_state
@@ -207,7 +207,7 @@ def test_hands_without_an_object_are_seen_before_the_first_video(
         ({"f": "2", "show": "hands"}, None),
         ({"f": "2", "show": "hands", "from": "view1"}, "view1"),
     ):
-        content = open_run(catalog, "hands")
+        content = open_run_content(catalog, "hands")
         state = complete_state(state_from_query(query), content)
         assert state.layers.looks_from == looks_from, query
 

@@ -13,7 +13,7 @@ from viewer_client import ViewerClient
 from viewer_world import FolderCatalog, hear_all, make_run, rest_at, sheet
 
 from app.exports.permalink import state_from_query
-from app.viewer.content.content import open_run
+from app.viewer.content.content import open_run_content
 from app.viewer.content.layers import default_layers, next_form
 from app.viewer.content.session_state import SessionState
 from app.viewer.scene.framing import frame_content
@@ -179,7 +179,7 @@ def test_the_surface_stands_for_splats_where_colors_mean_something(sessions) -> 
 
 
 def test_what_comes_next_is_what_there_is(catalog) -> None:
-    content = open_run(catalog, "seen")
+    content = open_run_content(catalog, "seen")
     layers = default_layers(content)
     bare = replace(content, splats=None)
     assert next_form(layers, content) == "splats"
@@ -192,7 +192,7 @@ def test_what_comes_next_is_what_there_is(catalog) -> None:
 
 
 def test_a_playing_frame_of_many_splats_is_small(server, catalog) -> None:
-    content = open_run(catalog, "seen")
+    content = open_run_content(catalog, "seen")
     content = replace(content, splats=splats_on(sheet(), 20_000))
     rollout = content.fitted
     assert rollout is not None
@@ -222,4 +222,4 @@ def test_a_playing_frame_of_many_splats_is_small(server, catalog) -> None:
 
 def test_splats_of_another_object_are_refused_by_name(catalog) -> None:
     with pytest.raises(RunError, match=r"splats\.safetensors is damaged: rest_node has 70 nodes"):
-        open_run(catalog, "odd")
+        open_run_content(catalog, "odd")

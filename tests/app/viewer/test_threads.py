@@ -21,7 +21,7 @@ from app.viewer.compare.camera import Eye
 from app.viewer.content.content import Content
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
-from app.viewer.physics.history import Setting
+from app.viewer.physics.history import TriedSetting
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 
@@ -216,7 +216,7 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
         control.handle._impl.value = 9.0
         # Whichever comes first: what shows the parameters in force leaves what a user moved.
 
-        def substeps() -> Setting:
+        def substeps() -> TriedSetting:
             return panel.history.set("substeps_per_frame", 77)
 
         others = [

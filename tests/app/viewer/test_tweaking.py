@@ -12,7 +12,7 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS
 from waiting import LIMIT_S, until
 
-from app.viewer.physics.history import Setting
+from app.viewer.physics.history import TriedSetting
 from app.viewer.physics.keep_panel import SavedRun, run_changes
 from app.viewer.physics.parameters import Knob
 from app.viewer.sessions import Sessions
@@ -108,7 +108,7 @@ def test_every_control_takes_the_same_value_again_after_a_reset(sessions) -> Non
         history, fitted = panel.history, panel.history.setting
         client.set("Simulation", "Hold")  # What is asked for matters, and not what becomes of it.
 
-        def press(name: str, expected: Setting) -> None:
+        def press(name: str, expected: TriedSetting) -> None:
             client.set("Steps", name)
             client.until(lambda: history.setting == expected)
             written = threading.Event()

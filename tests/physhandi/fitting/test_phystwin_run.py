@@ -10,7 +10,7 @@ from phystwin_case import FRAMES, Case, edit_pickle, save_pickle, write_case
 from phystwin_experiment import OPTIMUM, Experiment, save_checkpoint, write_experiment
 from sheet_sequence import write_sheet
 
-from app.viewer.content.content import open_run
+from app.viewer.content.content import open_run_content
 from physhandi import pipeline
 from physhandi.data.importers.phystwin import import_phystwin
 from physhandi.data.sequence import Sequence
@@ -119,7 +119,7 @@ def test_the_viewer_opens_it(run: Run, sequence: Sequence) -> None:
         def sequence(self, sequence_id: str) -> Sequence:
             return sequence
 
-    content = open_run(OneRun(), run.id)
+    content = open_run_content(OneRun(), run.id)
     assert (content.frame_count, content.reconstruction_count) == (FRAMES, 3)
     assert content.fitted is not None
     assert content.fitted.is_complete

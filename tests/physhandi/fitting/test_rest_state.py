@@ -67,6 +67,19 @@ def test_a_rope_is_thin_too():
     assert height.max() > 0.06
 
 
+def test_no_node_begins_below_its_clearance():
+    # On the flank of a rope one node stands above another, and both are lower than most.
+    x = 0.01 * np.arange(40)
+    node = np.column_stack([x, 0.0 * x, np.full(40, GROUND + 0.009)])
+    node[20, 2] = GROUND + 0.005
+    node = np.vstack([node, [x[20], 0.002, GROUND + 0.008], [x[30], 0.002, GROUND + 0.013]])
+    for kind in ("rope", "sheet"):
+        clearance = resting_clearance(node, GROUND, kind)
+        expected = np.append(np.full(40, 0.009), [0.008, 0.009])
+        expected[20] = 0.005
+        np.testing.assert_allclose(clearance, expected, atol=1e-6)
+
+
 def test_a_thick_rope_rests_although_its_nodes_are_far_above_the_ground():
     x = 0.01 * np.arange(40)
     node = np.column_stack([x, 0.2 * x, np.full(40, GROUND + 0.02)])

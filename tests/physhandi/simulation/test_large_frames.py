@@ -69,7 +69,7 @@ def test_a_block_has_the_room_that_its_device_leaves():
 )
 def test_threads_suit_the_blocks(own, locals_, springs, expected):
     layout = LargeLayout.of(blocks_of(own, locals_, springs), 3584)
-    assert (layout.lanes, layout.kept, layout.threads, layout.locals) == expected
+    assert (layout.lanes, layout.in_registers, layout.threads, layout.locals) == expected
 
 
 def test_room_is_not_rounded_up_beyond_the_device():
@@ -93,9 +93,9 @@ def test_blocks_move_as_the_oracle_says(side, large):
     "layout",
     [
         None,
-        LargeLayout(lanes=1, kept=16, threads=512, locals=1024),
-        LargeLayout(lanes=2, kept=3, threads=32, locals=704),
-        LargeLayout(lanes=8, kept=1, threads=64, locals=3584),
+        LargeLayout(lanes=1, in_registers=16, threads=512, locals=1024),
+        LargeLayout(lanes=2, in_registers=3, threads=32, locals=704),
+        LargeLayout(lanes=8, in_registers=1, threads=64, locals=3584),
     ],
     ids=["chosen", "all kept", "turns", "much room"],
 )
@@ -149,10 +149,10 @@ def test_fifty_thousand_nodes_choose_this_kernel_and_few_do_not():
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("kept", [1, 16])
-def test_material_and_world_may_change_between_frames(kept, large):
+@pytest.mark.parametrize("in_registers", [1, 16])
+def test_material_and_world_may_change_between_frames(in_registers, large):
     model, control = thrown_block(6, frames=4)
-    layout = LargeLayout(lanes=1, kept=kept, threads=512, locals=1024)
+    layout = LargeLayout(lanes=1, in_registers=in_registers, threads=512, locals=1024)
     fast, slow = large(model, layout=layout), recorded(model, "cuda:0")
     ends = []
     for changes in (True, False):

@@ -41,13 +41,13 @@ def bounce_adjoint(world: World, offset: wp.vec3, rate: wp.vec3, gain_bar: wp.ve
     speed = wp.max(sliding_speed, SLIDING_SPEED)
     half = 0.5 * (1.0 + restitution)
     keep = wp.max(0.0, 1.0 + 2.0 * friction * half * closing / speed)
-    kept = 0.5 * (1.0 - keep)
+    share = 0.5 * (1.0 - keep)
 
     before = BounceAdjoint()
     along = wp.dot(normal, gain_bar)
     closing_bar = half * along
     normal_bar = (half * closing) * gain_bar
-    sliding_bar = kept * gain_bar
+    sliding_bar = share * gain_bar
     restitution_bar = 0.5 * closing * along
     friction_bar = float(0.0)
     if keep > 0.0:
@@ -56,7 +56,7 @@ def bounce_adjoint(world: World, offset: wp.vec3, rate: wp.vec3, gain_bar: wp.ve
         restitution_bar -= 0.5 * friction * closing * across
         friction_bar = -half * closing * across
         if sliding_speed > SLIDING_SPEED:
-            sliding_bar -= (kept * across / speed) * sliding
+            sliding_bar -= (share * across / speed) * sliding
     closing_bar -= wp.dot(sliding_bar, normal)
     normal_bar += closing_bar * rate - closing * sliding_bar
     before.rate = sliding_bar + closing_bar * normal
