@@ -105,7 +105,8 @@ def measure_viewer(
 
     Raises:
         MissingInputError: If the run has no object there, or a browser is asked for and missing.
-        ServerFailedError: If the server does not start or does not do what it is asked.
+        RunError: If the server does not start.
+        ServerFailedError: If it does not do what it is asked.
     """
     start_warp()
     about = describe_machine("cpu")
