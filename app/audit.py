@@ -1,4 +1,4 @@
-"""Who changed what, and when: a line of JSON for each request that is to change something."""
+"""Audit log: a line of JSON for each request that is to change something."""
 
 import hashlib
 import json

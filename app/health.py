@@ -1,4 +1,4 @@
-"""What those who operate a server ask it: whether it lives, whether it can work, and its figures.
+"""Endpoints for operators of a server: liveness, readiness and metrics.
 
 ``/healthz`` and ``/readyz`` answer everybody, for a container's probes and load balancers, and tell
 no names and no paths; ``/metrics`` needs the token, as everything else does.

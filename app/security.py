@@ -1,4 +1,4 @@
-"""Who may come in: one ASGI middleware in front of every http request and websocket."""
+"""Access control: one ASGI middleware in front of every http request and websocket."""
 
 import base64
 import hashlib
@@ -41,7 +41,7 @@ LOOKING = (
     ("POST", "/api/v1/runs/check"),
     ("POST", f"/api/v1/runs/{_ID}/(export|replay)"),
 )
-"""What who may only look asks for by other methods than GET: live scenes of one's own, in which
+"""Requests by other methods than GET that read-only access allows: own live scenes, in which
 nothing can be kept, and files. All else is refused, so that a new route is guarded by itself."""
 _LOOKING = tuple((method, re.compile(path)) for method, path in LOOKING)
 
@@ -84,11 +84,11 @@ READ_ONLY = (
     "You may only look here. Open the server's full address, or ask who runs it, to launch, "
     "change, share or delete."
 )
-"""What who may only look is told."""
+"""Message to a visitor with read-only access whose request is refused."""
 PROBES = frozenset({"/healthz", "/readyz"})
-"""What answers everybody, and tells nothing of anybody; see `app.health`."""
+"""Paths that are open to everybody and reveal nothing; see `app.health`."""
 SHARED = "/shared/"
-"""Where pages are that can be looked at without the token; see `app.exports.shares`."""
+"""Path below which pages can be read without the token; see `app.exports.shares`."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a person sees in a real browser, and when: the home page, a live scene and its slider."""
+"""Delays in a real browser: the home page, a live scene and its slider."""
 
 import json
 import re

@@ -41,7 +41,7 @@ CAPTURE_GOALS: Mapping[str, float] = {
     "camera_turn_deg": 0.3,
     "chamfer_ratio": 1.25,
 }
-"""What an import is to reach: at least overlaps and living tracks, at most everything else."""
+"""Goals of an import: at least for overlaps and living tracks, at most for everything else."""
 _AT_LEAST = ("object_iou", "hand_iou", "tracks_alive", "tracks_alive_in_each_view")
 _MODULE = "app.benchmarks.capture"
 _RESULT = "capture.json"
@@ -54,7 +54,7 @@ _MILLIMETRES = 1e3
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOrder:
-    """What is measured of every scene."""
+    """Options of the measurement of a scene."""
 
     image_size: CaptureSize = "half"
     """Size of the pictures."""
@@ -69,7 +69,7 @@ class CaptureOrder:
     device: str = "cpu"
     """Warp device of the fits; pictures are drawn there, too, if Warp has no CPU device."""
     resolution: Literal["fine", "tiny"] = "fine"
-    """How many nodes the bodies get; ``tiny`` is for tests."""
+    """Size of the bodies in nodes; ``tiny`` is for tests."""
 
 
 def benchmark_capture(
@@ -169,7 +169,7 @@ def _shared_threads(jobs: int) -> int:
 
 
 class ScenePlace:
-    """Where the files of a scene are; sequences have one name, by which runs are compared."""
+    """Paths of a scene's files; sequences have one name, by which runs are compared."""
 
     def __init__(self, folder: Path, scene: str, seed: int) -> None:
         self.name = f"{scene.replace('/', '_')}_{seed}"

@@ -1,4 +1,4 @@
-"""How long the live simulation process takes from a slider to the first new frame."""
+"""Latency of the live simulation process from a slider to the first new frame."""
 
 import queue
 import time
@@ -26,14 +26,14 @@ _FARTHEST = 0.12
 _STEERED, _TURNS_AFTER = 240, 20
 """Frames that are steered, and after how many the hand turns round."""
 _LIFT = 0.5
-"""How far the hand goes up, in extents of what holds the object."""
+"""Height to which the hand goes up, in extents of what holds the object."""
 MOVES = 12
 """Slider positions of each kind that are asked for."""
 
 
 @dataclass(frozen=True)
 class _Answer:
-    """What the process said to one request, and when [s after the request]."""
+    """Messages of the process after one request, and their times [s after the request]."""
 
     seconds: list[float]
     messages: list[Message]

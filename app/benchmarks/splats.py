@@ -1,4 +1,4 @@
-"""How an object is shown as splats: pictures a second in a browser, bytes and work of a frame."""
+"""Speed of an object shown as splats: pictures a second in a browser, bytes and work of a frame."""
 
 import itertools
 import threading
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 COUNTS = (1_000, 5_000, 20_000)
 """Numbers of splats that are shown."""
 BUDGETED = "splats_5000"
-"""What is held against the goals."""
+"""Name of the scene that is compared with the goals."""
 _RATE = 30.0
 _OVERLAP = 0.7
 """Deviation of a made splat, in distances between splats."""

@@ -43,12 +43,12 @@ _LISTS = ("/", "/runs", "/api/v1/runs")
 
 @dataclass(frozen=True)
 class Goal:
-    """What a figure is to reach."""
+    """Goal of a figure."""
 
     part: Part
-    """Which part measures it."""
+    """Part that measures it."""
     path: tuple[str, ...]
-    """Where the figure stands in what the part returns."""
+    """Keys of the figure in the part's result."""
     limit: float
     """The goal."""
     is_least: bool = False
@@ -76,7 +76,7 @@ GOALS: Mapping[str, Goal] = {
 
 @dataclass(frozen=True)
 class _Effort:
-    """How often things are repeated."""
+    """Numbers of repetitions."""
 
     moves: int
     visits: int

@@ -1,4 +1,4 @@
-"""What `physhandi doctor` says of a data folder, and `physhandi reindex`."""
+"""Checks of a data folder by `physhandi doctor`, and `physhandi reindex`."""
 
 import os
 from collections.abc import Iterator

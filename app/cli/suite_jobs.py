@@ -44,7 +44,7 @@ _INTERVAL_S = 0.2
 _TELL_EVERY_S = 0.5
 _BEAT_S = 5.0
 _SAME = ("device_name", "system", "python", "packages", "code")
-"""What all machines that compute cells of one table must have in common."""
+"""Properties that all machines that compute cells of one table must share."""
 
 
 class SuiteJobs:

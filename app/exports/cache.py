@@ -52,7 +52,7 @@ class FileJob:
     of: int = 0
     """All steps; 0 before that is known."""
     last_used: float = field(default_factory=time.monotonic)
-    """When somebody asked for it."""
+    """Time of the last request for it [s, clock of `time.monotonic`]."""
 
     @property
     def state(self) -> Literal["making", "ready", "failed"]:

@@ -73,15 +73,15 @@ class PictureOptions:
     turn: Turn = 0.0
     """Angle by which the camera goes round [degrees]."""
     camera_path: CameraPathField = ""
-    """How the camera of a film moves; docs/formats.md describes the JSON."""
+    """Camera path of a film; docs/formats.md describes the JSON."""
     view: FilmedFrom = ""
     """Camera of the recording from which a film is taken."""
     beside: Annotated[Beside | None, Query(description=_BESIDE)] = None
-    """What is beside such a film."""
+    """Picture beside such a film."""
 
 
 class FileProgress(BaseModel):
-    """How far a file is that is being made."""
+    """Progress of a file that is being made."""
 
     state: Literal["making", "ready", "failed"]
     """Whether it is being made, is there, or could not be made."""

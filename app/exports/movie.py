@@ -19,7 +19,7 @@ from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 
 FILMED_PIXELS_PER_SECOND = 2_500_000
-"""What a busy core draws; an idle one draws 4 million (the bundled run, 1280 x 720 pixels)."""
+"""Pixels a second that a busy core draws; an idle one draws 4 million (bundled run, 1280 x 720)."""
 _GIF_STEP_MS = 10
 """Pictures of a GIF are shown for a multiple of this time [ms]."""
 _GIF_COLORS = 256

@@ -95,7 +95,7 @@ class Offscreen:
 
     @property
     def pose(self) -> Pose:
-        """Where the camera stands."""
+        """Pose of the camera."""
         return Pose.first(self.server.initial_camera)
 
     def draw(self, frame: int, *, is_playing: bool) -> None:

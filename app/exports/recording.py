@@ -13,9 +13,9 @@ from physhandi.object_rollout import ObjectRollout
 LONGEST_RECORDING = 3_000
 """Longer sequences are not recorded."""
 BYTES_FOR_300_FRAMES = 20_000_000
-"""What a recording of 300 frames may weigh, springs and arrows giving way."""
+"""Largest size of a recording of 300 frames [bytes]; springs and arrows are left out to keep it."""
 _PACKING = 0.97
-"""What is left for frames of a file, beside what describes the scene."""
+"""Share of it for frames, beside the description of the scene."""
 
 
 def record_scene(

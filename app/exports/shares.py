@@ -48,7 +48,7 @@ _POLICY = (
 
 
 class StoredShare(BaseModel):
-    """What is kept of a share beside its page."""
+    """Description of a share, stored beside its page."""
 
     run: str
     """Id of the run that it shows."""
@@ -57,7 +57,7 @@ class StoredShare(BaseModel):
     query: str = ""
     """The view, as the part of a link after the question mark."""
     created: str
-    """When it was made, in UTC."""
+    """Time of creation, in UTC."""
 
 
 class Share(StoredShare):

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 _FORMAT = "physhandi-run-index/1"
 _WORTH_SAVING = 50
 DEFECT = "a mistake of the program, whose log tells more"
-"""What is to blame where no error of ours was expected."""
+"""Cause that is named where no error of ours was expected."""
 
 Stamp = tuple[int, ...]
 

@@ -24,9 +24,9 @@ class KeyedRequest:
     """A wish for a run that may come several times."""
 
     key: str
-    """What the client calls it, hashed: it may be of any length."""
+    """The client's key, hashed: it may be of any length."""
     body: str
-    """What is wished for, hashed."""
+    """The request's body, hashed."""
 
     @classmethod
     def of(cls, key: str, body: Mapping[str, Any]) -> "KeyedRequest":

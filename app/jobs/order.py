@@ -1,4 +1,4 @@
-"""What a fit is asked to do: a profile, what differs from it, and the run it is made from."""
+"""Orders of fits: a profile, what differs from it, and the run it is made from."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

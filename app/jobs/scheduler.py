@@ -109,19 +109,19 @@ class JobView:
     is_published: bool = False
     """Whether there are results to look at."""
     priority: Priority | None = None
-    """How urgent it is, of a run that waits."""
+    """Priority of a run that waits."""
 
 
 @dataclass(frozen=True)
 class LostRun:
-    """What was done with a run that had lost its process."""
+    """A run that had lost its process, and what was done with it."""
 
     time: str
-    """When, ISO 8601."""
+    """Time, ISO 8601."""
     run: str
     """Id of the run."""
     why: str
-    """What happened, and what became of it."""
+    """The loss, and its consequence for the run."""
 
 
 class Scheduler:
@@ -454,7 +454,7 @@ class Scheduler:
 
     @property
     def place(self) -> str:
-        """Where fits run, for people: devices of this machine, or a cluster."""
+        """Name of the place where fits run: devices of this machine, or a cluster."""
         return self._engine.name or ", ".join(self._settings.devices)
 
     @property

@@ -37,7 +37,7 @@ _SHOWN: dict[str, tuple[str, Any]] = {
     "environment": (ENVIRONMENT, EnvironmentFile),
     "parameters": (PARAMETERS_FILE, dict[str, Any]),
 }
-"""What a run's page shows of its results, with file and shape."""
+"""Results that a run's page lists, with file and shape."""
 CURVE_LIMIT = 2000
 """Most points of a curve that are sent to a browser."""
 # Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
@@ -294,7 +294,7 @@ def _names(run: Run) -> Sequence[str]:
 
 
 def _running_since(run: Run, finished: Sequence[Mapping[str, Any]]) -> float | None:
-    """When the stage that is at work began: at the end of the one before, or of this attempt."""
+    """Start of the current stage: the end of the one before, or the start of this attempt."""
     environment = named_fields(run.json(ENVIRONMENT)) if run.has(ENVIRONMENT) else None
     times = [(environment or {}).get("started"), *(stage.get("time") for stage in finished[-1:])]
     return max((begin for time in times if (begin := moment_of(time)) is not None), default=None)
@@ -323,17 +323,17 @@ _DEFECT = (
 
 
 _NO_DEVICE_MEMORY = re.compile(r"Failed to allocate \d+ bytes on device|CUDA out of memory")
-"""What Warp and PyTorch say."""
+"""Messages of Warp and PyTorch about a lack of memory."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a run failed."""
+    """Cause of a run's failure."""
 
     message: str
-    """What happened."""
+    """Description of the cause."""
     advice: str
-    """What the user can do."""
+    """Advice to the user."""
 
 
 def explain(run: Run | None, reason: str, *, is_damaged: bool = False) -> Failure:

@@ -1,4 +1,4 @@
-"""What browsers follow: changes in the list of runs, and one run with its progress and its log."""
+"""Event streams for browsers: changes of the list of runs; progress and log of one run."""
 
 import os
 import re

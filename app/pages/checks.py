@@ -26,7 +26,7 @@ _AGAIN = {"Cache-Control": "no-store"}
 
 
 class FrameQuery(BaseModel):
-    """What is drawn of a frame; the fields are the parameters of an address."""
+    """Picture of a frame; the fields are the parameters of an address."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -25,7 +25,7 @@ _SPLITS = {"reconstruction": "fitted frames", "future": "predicted frames"}
 _UNCOMPARED = {"description", "aggregation", "unit", "frames"}
 
 _TOLD_ELSEWHERE = {"profile", "edits", "overrides"}
-"""What a configuration has of its own beside settings; those that override a profile are in it."""
+"""Keys of a configuration beside settings; those that override a profile are in it."""
 _CHANGED = "parameters."
 """Settings that begin so are the parameters that a simulation was asked to change."""
 _NOTICED = 0.005
@@ -42,7 +42,7 @@ class ComparedCell:
     is_best: bool = False
     """Whether no other run is better."""
     change: str = ""
-    """How much it differs from the first run."""
+    """Its difference from the first run."""
     moment: str = ""
     """If the text is a time, what browsers show in their own time zone; ISO 8601."""
 

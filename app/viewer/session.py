@@ -189,7 +189,7 @@ class Session(SceneServer):
 
     @property
     def camera_path(self) -> CameraPath | None:
-        """What the camera of a film follows; None if it stands still."""
+        """Path of a film's camera; None if it stands still."""
         return self._path.path
 
     def go(self, frame: int) -> None:

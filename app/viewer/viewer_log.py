@@ -1,4 +1,4 @@
-"""What is written about viser connections that fail, which whoever connects can bring about."""
+"""Log of failed viser connections, which anybody who connects can cause."""
 
 import logging
 import threading

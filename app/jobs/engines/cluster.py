@@ -27,7 +27,7 @@ class ClusterError(RunError):
 
 @dataclass(frozen=True)
 class Demand:
-    """What a job asks of the node that it runs on."""
+    """Resources that a job requests of the node that it runs on."""
 
     cpus: int = 1
     """Processors."""
@@ -48,14 +48,14 @@ class Demand:
 
 @dataclass(frozen=True)
 class ClusterJob:
-    """What a cluster knows of a job."""
+    """State of a job, as the cluster reports it."""
 
     status: str
     """PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED."""
     message: str = ""
-    """What it tells of it."""
+    """The cluster's message about it."""
     metadata: Mapping[str, Any] | None = None
-    """What was given with it."""
+    """Metadata that was submitted with it."""
 
 
 class Cluster:

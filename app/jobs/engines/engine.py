@@ -1,4 +1,4 @@
-"""Where the processes of fits run: on this machine, or on a cluster."""
+"""Engines, on which the processes of fits run: this machine, or a cluster."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ class Engine(Protocol):
 
     @property
     def slots(self) -> int:
-        """How many fits it runs side by side."""
+        """Number of fits that it runs side by side."""
         ...
 
     @property

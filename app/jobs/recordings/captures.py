@@ -22,9 +22,9 @@ class CaptureEntry:
     """A folder or bag that is listed."""
 
     name: str
-    """What it is called."""
+    """Its name."""
     place: str
-    """What it is asked for by: the folder's name and the way from there, with slashes."""
+    """Path by which it is requested: the folder's name and the way from there, with slashes."""
     is_bag: bool
     """Whether it is a bag."""
 

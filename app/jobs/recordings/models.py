@@ -21,9 +21,9 @@ class ModelEntry:
     name: str
     """Name of its folder."""
     finds: Finds
-    """What it finds; what finds tracks is code, which is executed."""
+    """Kind of annotation that it makes; networks for tracks are code, which is executed."""
     kind: str
-    """What it is, as provenance calls it."""
+    """Its kind, as provenance calls it."""
 
 
 class ModelFolders:

@@ -1,4 +1,4 @@
-"""What the server found in its data folder and mended, for its page and the API."""
+"""Recovery of the server's data folder, for its page and the API."""
 
 import logging
 import threading
@@ -23,11 +23,11 @@ class DamagedFolder:
     """A run or sequence that cannot be read."""
 
     kind: ItemKind
-    """What it is."""
+    """Its kind."""
     id: str
     """Name of its folder."""
     why: str
-    """What is wrong with it; names file and field."""
+    """Its defect; names file and field."""
 
 
 def damaged_folders(catalog: Catalog, scheduler: Scheduler) -> list[DamagedFolder]:

@@ -1,4 +1,4 @@
-"""What of a data folder may go after a time or beyond a size; nothing, unless that is set.
+"""Retention: what is removed from a data folder after a time or beyond a size; nothing by default.
 
 No rule touches what a run was asked for, how it ended, or what it has published, so every run,
 shared page and link stays what it is. What goes is what can be computed again, or tells how an
@@ -37,7 +37,7 @@ class Expendable:
     kind: ExpendableKind
     """Attempts of a run, its log and last preview, a file of the cache, or an upload."""
     name: str
-    """Where it is in the data folder."""
+    """Its path in the data folder."""
     bytes: int
     """Space that is free afterwards."""
     days: float

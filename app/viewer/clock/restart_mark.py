@@ -1,4 +1,4 @@
-"""Where on the timeline prediction starts from the observed state."""
+"""Mark on the timeline at which prediction starts from the observed state."""
 
 import viser
 

@@ -68,7 +68,7 @@ class ObservedError:
 
     @property
     def source(self) -> str:
-        """What it is a distance from."""
+        """Reference of the distance."""
         if self._tracks is None:
             return "the nearest observed point"
         return self._tracks.name
@@ -139,7 +139,7 @@ class Painted:
     values: Values
     """The quantity at nodes and springs."""
     scale: ColorScale
-    """Which color means which value."""
+    """The color scale."""
 
     @property
     def node(self) -> UInt8[ndarray, "node 3"]:
@@ -179,7 +179,7 @@ class Painter:
         self._content_mass = content.mass
         self._node_count = 1 if content.fitted is None else content.fitted.model.node_count
         self.mass: ObjectMass | None = content.mass
-        """What the object weighs; None if nobody knows."""
+        """Mass of the object; None if unknown."""
         self._ranges: dict[
             tuple[Coloring, _Parts], tuple[ObjectRollout, ObjectRollout | None, int, Limits]
         ] = {}
@@ -192,7 +192,7 @@ class Painter:
 
     @property
     def offered(self) -> tuple[Coloring, ...]:
-        """What can be told of the content's object; nothing without one."""
+        """Colorings of the content's object; none without one."""
         if not self._has_object:
             return ()
         return tuple(c for c in COLORINGS[1:] if c != "error" or self.errors.is_known)
@@ -215,7 +215,7 @@ class Painter:
 
     @property
     def kilograms(self) -> float:
-        """What the object weighs as forces are written [kg]: as its model if nobody knows."""
+        """Mass for which forces are written [kg]: that of the model if the object's is unknown."""
         return float(self._node_count) if self.mass is None else self.mass.kilograms
 
     @property

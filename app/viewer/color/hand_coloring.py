@@ -42,7 +42,7 @@ class HandPainter:
 
     @property
     def offered(self) -> tuple[Coloring, ...]:
-        """What can be told; nothing where there is no hand with a surface."""
+        """Available colorings; none where there is no hand with a surface."""
         if not any(hand.face is not None for hand in self._hands):
             return ()
         is_known = any(self._error(hand) is not None for hand in self._hands)

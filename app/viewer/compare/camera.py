@@ -1,4 +1,4 @@
-"""Where the cameras stand while two sides are shown beside each other, and how they come back."""
+"""Cameras while two sides are shown beside each other, and their way back."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -30,7 +30,7 @@ _THIS, _FIT = "this rollout", "the fit"
 _LONGEST_TEXT = 70
 
 Compared = Literal["kept", "phystwin"]
-"""What the rollout of the sliders is compared with: A that was kept, or B held as by PhysTwin."""
+"""Counterpart of the sliders' rollout: A that was kept, or B held as by PhysTwin."""
 
 
 class LiveComparison:
@@ -251,7 +251,7 @@ class LiveComparison:
             return self._cameras.forget(client)
 
     def pose(self) -> Pose | None:
-        """Where the first client's camera stands in the scene; None without clients."""
+        """Pose of the first client's camera in the scene; None without clients."""
         clients = list(self._server.get_clients().values())
         return self._cameras.before(clients[0]) if clients else None
 

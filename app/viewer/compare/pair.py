@@ -1,4 +1,4 @@
-"""Which two runs are compared, and what has to be said of the pair."""
+"""The two runs of a comparison, and notes about the pair."""
 
 import math
 from dataclasses import dataclass
@@ -76,11 +76,11 @@ class Pair:
     """Two runs that are shown together."""
 
     contents: tuple[Content, Content]
-    """What A and B show."""
+    """Contents of A and B."""
     clock: CompareClock
     """The time that both share."""
     notes: tuple[str, ...]
-    """What a user should know before believing what is seen."""
+    """Warnings about the comparison."""
     can_measure: bool
     """Whether the difference means something."""
 

@@ -19,16 +19,16 @@ PROFILE = "phystwin"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhysTwinBaseline:
-    """What the comparison with PhysTwin simulates: the run's object, held in PhysTwin's way."""
+    """Baseline of the comparison with PhysTwin: the run's object, held in PhysTwin's way."""
 
     controls: Int[ndarray, " chosen"]
-    """Which of the run's control nodes hold the object."""
+    """Numbers of the run's control nodes that hold the object."""
     parameters: SimulationParameters
     """The fitted parameters with PhysTwin's virtual springs."""
     source: str
-    """Where the control nodes come from, in a few words."""
+    """Source of the control nodes, in a few words."""
     note: str = ""
-    """What is not as in PhysTwin, or why there is little to compare; empty if all is."""
+    """Differences from PhysTwin, or why there is little to compare; empty if there are none."""
 
     @staticmethod
     def is_offered(content: Content) -> bool:

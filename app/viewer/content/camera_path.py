@@ -19,7 +19,7 @@ from physhandi.errors import UsageError
 PATH_FORMAT = "physhandi-camera-path/1"
 MOST_KEYS = 1_000
 _STEEPEST = 3.0
-"""How much faster than on either side of a key frame the camera may pass it: more overshoots."""
+"""Largest ratio of the camera's speed at a key frame to that on either side: more overshoots."""
 _FIELDS = {"frame", "position", "look_at", "up", "fov"}
 _SAME = 1e-9
 
@@ -151,7 +151,7 @@ class CameraPath:
 
 
 CameraMotion = CameraPath | Turntable
-"""How the camera of a film moves."""
+"""Motion of a film's camera."""
 
 
 def read_camera_path(path: Path) -> CameraMotion:

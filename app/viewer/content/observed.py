@@ -1,4 +1,4 @@
-"""What was seen: points and clouds of a frame, identified tracks and markers, hand keypoints."""
+"""Observations: points and clouds of a frame, identified tracks and markers, hand keypoints."""
 
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
@@ -157,7 +157,7 @@ class Tracks:
 
     @property
     def name(self) -> str:
-        """What they are called: whoever knows their nodes has markers."""
+        """Their name: points with known nodes are markers."""
         return "the tracks" if self.node is None else "the markers"
 
 
@@ -166,7 +166,7 @@ class Markers:
     """Markers that keep their number over the frames."""
 
     point: Float[ndarray, "frame marker 3"]
-    """Where they are [m]; NaN where they are not seen."""
+    """Positions [m]; NaN where they are not seen."""
     held: tuple[int, ...]
     """Those that sit on what moves the object, and are control points therefore."""
     links: Int[ndarray, "link 2"]

@@ -64,7 +64,7 @@ _STIFFNESS, _DAMPING = "Stiffness", "Damping"
 _CUT, _JOIN = "Cut", "Join"
 _PIN, _ATTACH, _RELEASE = "Pin", "Attach", "Release"
 _PART_OF_SURFACE = 0.25
-"""How far behind the surface nodes still belong to it, in distances of nodes."""
+"""Depth behind the surface to which nodes still belong to it, in distances of nodes."""
 _FACTORS = (0.001, 1000.0)
 _MODIFIERS: dict[str | None, SelectWay] = {None: "replace", "shift": "add", "cmd/ctrl": "remove"}
 _STYLE = "font-size:0.85em;line-height:1.5;padding:0.2em 0.9em 0.5em"
@@ -212,7 +212,7 @@ class EditPanel:
 
     @property
     def selection(self) -> Selection:
-        """What is selected."""
+        """The selection."""
         return self._selection
 
     def toggle(self) -> None:

@@ -103,7 +103,7 @@ class Inspector:
 
     @property
     def pick(self) -> Pick | None:
-        """What was clicked."""
+        """The clicked thing."""
         return self._pick
 
     def replace(self, content: Content, scene: SceneDrawing, framing: Framing) -> None:

@@ -47,25 +47,25 @@ _CRASH_WINDOW = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class LiveRequest:
-    """What to simulate."""
+    """Request for a rollout."""
 
     run: Path
     """Run folder."""
     sequence: str
     """One of the run's sequences."""
     parameters: SimulationParameters
-    """What to simulate it with."""
+    """Parameters of the simulation."""
     automatic_substeps: bool = False
     """Whether to use as few substeps as are stable, instead of the parameters' number."""
     controls: tuple[int, ...] | None = None
-    """Which of the run's control nodes may hold the object; None for all."""
+    """Numbers of the run's control nodes that may hold the object; None for all."""
     edits: Edits = ()
-    """What is done to single springs and nodes."""
+    """Edits of single springs and nodes."""
 
 
 @dataclass(frozen=True)
 class _Unfinished:
-    """What a session asked for and has not got yet."""
+    """Request of a session that is not answered yet."""
 
     message: Message
     has_crashed: bool = False

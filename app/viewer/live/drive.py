@@ -1,4 +1,4 @@
-"""How a steered hand follows what it is told: smoothly, and within its limits."""
+"""Motion of a steered hand: it follows orders smoothly and within its limits."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -27,16 +27,16 @@ _THERE = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class HandOrder:
-    """Where a hand shall go; the newest order holds until the next."""
+    """Order to a hand; the newest one holds until the next."""
 
     velocity: tuple[float, ...] = (0.0,) * 6
     """Speed of the wrist [m/s] and its turning about the world's axes [rad/s], without a goal."""
     goal: tuple[float, ...] | None = None
     """Place to go to: offset of the wrist [m] and rotation vector [rad]; None to move freely."""
     closing: float = 0.0
-    """How fast the fingers close [1/s]; negative for opening."""
+    """Speed at which the fingers close [1/s]; negative for opening."""
     bend: tuple[float, ...] | None = None
-    """How far each finger shall be bent on top of that [rad], see `Fingers`; None for as it is."""
+    """Target of each finger's bend on top of that [rad], see `Fingers`; None for no change."""
 
     def to_dict(self) -> dict[str, Any]:
         """Describe it in plain data."""
@@ -56,7 +56,7 @@ class HandOrder:
 
 @dataclass(frozen=True, kw_only=True)
 class HandLimits:
-    """What a steered hand cannot do, whatever it is told."""
+    """Limits of a steered hand, which hold for all orders."""
 
     top_speed: float
     """Its wrist moves no faster than this [m/s]."""
@@ -87,11 +87,11 @@ class HandDrive:
             fingers: Its fingers, if they bend one by one.
         """
         self.order = HandOrder()
-        """What the hand follows."""
+        """The order that the hand follows."""
         self.most_force = math.inf
         """Pulled at harder than this, the hand gives way [N]."""
         self.pose = np.array(pose, np.float64)
-        """Where the hand is."""
+        """Pose of the hand."""
         self._step = 1.0 / frame_rate
         self._top = np.array([limits.top_speed, TOP_TURN])
         self._yielding = _YIELDING * limits.top_speed

@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 
 class Mailbox:
-    """What is to be done next for each session: its newest request, then changes of its pace.
+    """Pending work of each session: its newest request, then changes of its pace.
 
     Of what steers a session's hands only the newest is kept, however often that is told.
     """
@@ -114,7 +114,7 @@ class PacedFrames:
 
     @property
     def due(self) -> float:
-        """When the next frame may be computed [s, clock of `time.monotonic`]."""
+        """Time from which the next frame may be computed [s, clock of `time.monotonic`]."""
         return self._due if self.may_advance else math.inf
 
     def set_pace(self, kind: str) -> None:

@@ -21,7 +21,7 @@ class Offered(Named, Protocol):
 
     @property
     def label(self) -> str:
-        """What the list shows."""
+        """Its entry in the list."""
         ...
 
     @property
@@ -65,7 +65,7 @@ class KeptChoice(Generic[Listed]):
         self._wanted = AS_FITTED
         self._turn = threading.Lock()
         self.problems: tuple[str, ...] = ()
-        """What is wrong with files of users."""
+        """Problems of users' files."""
         choice: Any = gui.add_dropdown(label, (AS_FITTED, BY_HAND), hint=hint)
         choice.on_update(guard.by_user(lambda _: self._take_choice()))
         self._choice = FollowedChoice(choice, guard)
@@ -86,7 +86,7 @@ class KeptChoice(Generic[Listed]):
 
     @property
     def chosen(self) -> Listed | None:
-        """What is in force, if it has a name; of several that was chosen."""
+        """The current entry, if there is one; of several the one that was chosen."""
         fits = {label: entry for label, entry in self._listed.items() if self._is_in_force(entry)}
         return fits.get(self._wanted, next(iter(fits.values()), None))
 

@@ -1,4 +1,4 @@
-"""What users keep under names for every scene of a server: one file each, in one folder."""
+"""Named items that users keep for every scene of a server: one file each, in one folder."""
 
 import logging
 import re
@@ -22,7 +22,7 @@ class Named(Protocol):
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Its name for people."""
         ...
 
 
@@ -36,11 +36,11 @@ class KeptFiles(Generic[Kept]):
     """
 
     what: str
-    """What one of them is called."""
+    """Word for one of them."""
     kinds: frozenset[str]
-    """How names of its files end; what is new ends as `new_kind` says."""
+    """Suffixes of its files; new ones have `new_kind`."""
     new_kind: str
-    """How names of new files end."""
+    """Suffix of new files."""
 
     def __init__(self, folder: Path, shown_folder: str) -> None:
         """Prepare; the folder is made when the first thing is kept.

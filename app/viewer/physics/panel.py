@@ -70,7 +70,7 @@ class SliderSet:
 
     @property
     def knobs(self) -> tuple[Knob | Switch, ...]:
-        """What can be moved."""
+        """Controls that change parameters."""
         return tuple(knob for knob, _ in self._controls)
 
     def add(self, *knobs: Knob | Switch) -> None:

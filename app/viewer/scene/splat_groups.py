@@ -34,7 +34,7 @@ class SplatGroups:
     splats: Splats
     """The splats."""
     binding: SplatBinding
-    """Which nodes carry them."""
+    """Binding of the splats to nodes."""
     group: Int[ndarray, " splat"]
     """Number of each splat's group; none is empty."""
 

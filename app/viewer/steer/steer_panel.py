@@ -61,16 +61,16 @@ _TIP_GIZMO_SIZE, _DOT_SIZE = 0.3, 0.07
 """Length of the axes of a gizmo on a fingertip, and width of the dots by which fingers and wrists
 are chosen: as parts of the hand from its wrist to the tip of its middle finger."""
 _ABOVE_TIP, _ABOVE_WRIST = 0.045, 0.16
-"""How far from tips and wrist dots lie on the backs of fingers and hand, where they are seen:
+"""Distances of the dots from tips and wrist, on the backs of fingers and hand, where they are seen:
 likewise."""
 _SPEED = 0.25
 """Speed of a wrist at first, in extents of the scene a second."""
 _TURN_SPEED = 90.0
 """Turning of a hand at first [°/s]."""
 _CLOSING = 0.8
-"""How fast keys close the fingers of a hand: all the way from open takes 2.5 s [1/s]."""
+"""Speed at which keys close the fingers of a hand: all the way from open takes 2.5 s [1/s]."""
 _GRAVITY = 9.81
-"""What a weight is compared with where nothing falls [m/s²]."""
+"""Gravity that weights are computed with where there is none [m/s²]."""
 _REFRESH = 0.25
 _COUNTED = 1.0
 """Time over which frames are counted [s]."""
@@ -118,7 +118,7 @@ Shown = tuple[ObjectRollout, int, Mapping[str, Float[ndarray, "vertex 3"]]]
 
 @dataclass(frozen=True)
 class Moved:
-    """What keys and the gizmo move: a hand, both, or one finger by its tip."""
+    """Target of keys and the gizmo: a hand, both, or one finger by its tip."""
 
     hands: tuple[int, ...]
     """Numbers of the hands, or that of a point that is held."""
@@ -843,7 +843,7 @@ class SteerPanel:
 
 
 class MotionFolder:
-    """What can be done with a recording: trim and smooth it, simulate it again, keep it."""
+    """Controls of a recording: trim and smooth it, simulate it again, keep it."""
 
     def __init__(
         self,
@@ -904,7 +904,7 @@ class MotionFolder:
 
     @property
     def motion(self) -> SteeredMotion:
-        """What is kept, smoothed."""
+        """The trimmed and smoothed motion."""
         first, last = (int(value) for value in self._part.value)
         return self._recorded.part(first, last, float(self._smooth.value))
 

@@ -49,7 +49,7 @@ class SteeredFrame:
     pose: Float[ndarray, "hand pose"]
     """Poses of the hands; see `SteeredMotion`."""
     pull: Float[ndarray, "hand 3"] | None = None
-    """How the object pulls at each hand [N]; None before the first frame was simulated."""
+    """Force of the object on each hand [N]; None before the first frame was simulated."""
 
 
 def begin_motion(
