@@ -75,8 +75,8 @@ class NewRun(BaseModel):
     accepts_missing: bool = False
     """Whether the object may be left out although depth was recorded; else that is refused."""
     priority: Priority = "normal"
-    """How urgent it is: ``high`` passes what came up to a day before, ``low`` lets by what comes up
-    to a day later."""
+    """Its priority: ``high`` passes what came up to a day before, ``low`` lets by what comes up to
+    a day later."""
 
 
 class Again(BaseModel):
@@ -90,7 +90,7 @@ class Again(BaseModel):
 
 
 class NewPriority(BaseModel):
-    """How urgent a fit in line is."""
+    """Priority of a fit in line."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -228,7 +228,7 @@ class UploadFile(BaseModel):
 
 
 class UploadName(BaseModel):
-    """What an upload is called."""
+    """Name of an upload."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -242,7 +242,7 @@ class NewUpload(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     name: ItemId
-    """What it is to be called."""
+    """Its name."""
     files: Annotated[list[UploadFile], Field(min_length=1, max_length=2 * MOST_FILES)]
 
 

@@ -1,4 +1,4 @@
-"""Who changed what, and when: a line of JSON for each request that is to change something."""
+"""Audit log: a line of JSON for each request that is to change something."""
 
 import hashlib
 import json
@@ -67,10 +67,10 @@ class AuditLog:
             if is_refused and not self._may_write_refused(now):
                 return
             at = datetime.fromtimestamp(now, UTC).isoformat(timespec="milliseconds")
-            told = {"time": at, **entry}
+            fields = {"time": at, **entry}
             if self._left_out:
-                told["left_out_before"] = self._left_out
-            line = json.dumps(told, ensure_ascii=True).encode() + b"\n"
+                fields["left_out_before"] = self._left_out
+            line = json.dumps(fields, ensure_ascii=True).encode() + b"\n"
             try:
                 self._append(line)
             except OSError as error:
@@ -89,13 +89,13 @@ class AuditLog:
         made = {} if run_id is None else {"run_id": run_id}
         self.write({"who": who, "may_change": True, "what": what, **made, "status": 200})
 
-    def note_removed(self, told: Mapping[str, Any]) -> None:
+    def note_removed(self, removed: Mapping[str, Any]) -> None:
         """Note what the server has removed by its rules.
 
         Args:
-            told: What it was, as plain values.
+            removed: What it was, as plain values.
         """
-        self.write({"who": "server", "may_change": True, **told, "status": 200})
+        self.write({"who": "server", "may_change": True, **removed, "status": 200})
 
     def _may_write_refused(self, now: float) -> bool:
         times = self._refused

@@ -40,5 +40,5 @@ class BodyLimit:
 
     def _error(self) -> HTTPException:
         most = f"{self._most / 2**20:g} MiB"
-        told = f"The request is too large: at most {most} are read."
-        return HTTPException(413, told, {"Connection": "close"})
+        message = f"The request is too large: at most {most} are read."
+        return HTTPException(413, message, {"Connection": "close"})

@@ -107,14 +107,14 @@ def _difference(pairing: Pairing | None) -> dict[str, Any] | None:
     if pairing is None:
         return None
     way = way_of(pairing.first, pairing.second)
-    told = [
+    measured = [
         compare_frames(pairing.first, first, pairing.second, second, way)
         for first, second in pairing.frames
     ]
     return {
         "way": way,
-        "mean": [frame.mean for frame in told],
-        "largest": [frame.largest for frame in told],
+        "mean": [frame.mean for frame in measured],
+        "largest": [frame.largest for frame in measured],
     }
 
 
@@ -122,7 +122,7 @@ def _errors(
     errors: list[dict[str, Any]], quantity: str, frames: list[tuple[int, int]]
 ) -> dict[str, list[float | None]]:
     """Look up a quantity of both runs at every tick; null where it was not measured."""
-    found: dict[str, list[float | None]] = {}
+    by_side: dict[str, list[float | None]] = {}
     for side, name in enumerate("ab"):
         rollout = named_fields(errors[side].get("rollout")) or {}
         numbers: Any = errors[side].get("frames")
@@ -131,6 +131,6 @@ def _errors(
         if not are_lists or not isinstance(rollout.get(quantity), list):
             continue
         pairs: list[tuple[Any, Any]] = list(zip(numbers, values, strict=False))
-        known = dict(pairs)
-        found[name] = [known.get(pair[side]) for pair in frames]
-    return found
+        by_frame = dict(pairs)
+        by_side[name] = [by_frame.get(pair[side]) for pair in frames]
+    return by_side

@@ -1,4 +1,4 @@
-"""Which two runs are to be compared and how: one model for addresses, orders and live scenes."""
+"""Request for a comparison of two runs: one model for addresses, orders and live scenes."""
 
 from typing import Annotated, Literal, Self
 from urllib.parse import parse_qsl, urlencode
@@ -15,7 +15,7 @@ Tint = Literal["side", "difference", "parts"]
 
 
 class CompareAsk(BaseModel):
-    """What a comparison is to show; the fields are those of an address ``/compare?…``."""
+    """Request for a comparison; the fields are those of an address ``/compare?…``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -26,9 +26,9 @@ class CompareAsk(BaseModel):
     sequence: Annotated[str | None, Field(min_length=1, max_length=200)] = None
     """A sequence of both; None for the first that both have."""
     mode: Mode = "side"
-    """How both are placed."""
+    """Arrangement of both."""
     color: Tint = "side"
-    """What the colors of the nodes mean."""
+    """Meaning of the nodes' colors."""
     f: Annotated[int, Field(ge=0, le=10_000_000)] = 0
     """Tick of the common clock: the frame, if both have one frame rate."""
 
@@ -43,7 +43,7 @@ class CompareAsk(BaseModel):
 
     @property
     def query(self) -> str:
-        """What stands behind ``/compare?``; what is as usual is left out."""
+        """Query of the address ``/compare?…``; default values are left out."""
         return urlencode(self.model_dump(exclude_defaults=True, exclude={"kind"}))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""What those who operate a server ask it: whether it lives, whether it can work, and its figures.
+"""Endpoints for operators of a server: liveness, readiness and metrics.
 
 ``/healthz`` and ``/readyz`` answer everybody, for a container's probes and load balancers, and tell
 no names and no paths; ``/metrics`` needs the token, as everything else does.
@@ -148,8 +148,8 @@ def create_health(
         free = machine.load()["disk"]["free"]
         if free < LEAST_DISK:
             reasons.append(f"The disk has {free / 2**20:.0f} MiB left; free some space.")
-        told = {"status": "not ready" if reasons else "ready", "reasons": reasons}
-        return JSONResponse(told, status_code=503 if reasons else 200)
+        state = {"status": "not ready" if reasons else "ready", "reasons": reasons}
+        return JSONResponse(state, status_code=503 if reasons else 200)
 
     @router.get("/metrics")
     def metrics(request: Request) -> Response:

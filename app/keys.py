@@ -35,7 +35,7 @@ Action = Literal[
     "steer",
     "edit",
 ]
-"""What a key does in the live scene."""
+"""Actions of keys in the live scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,11 +43,11 @@ class Key:
     """One key, or a row of keys that do the same to different things."""
 
     shown: tuple[str, ...]
-    """How it is written, key by key."""
+    """Its caption, key by key."""
     about: str
-    """What it does."""
+    """Its effect, for people."""
     action: Action | None = None
-    """What it triggers in the live scene; None for what the browser or the page does."""
+    """Action that it triggers in the live scene; None for keys of the browser or the page."""
     hotkeys: tuple[str, ...] = ()
     """Names by which the scene knows the keys."""
     modifier: Literal["shift", "cmd/ctrl", "cmd/ctrl+shift"] | None = None

@@ -1,4 +1,4 @@
-"""How the server writes its log: for people, or a JSON object a line, and never a secret."""
+"""The server's log: for people, or a JSON object a line, and never a secret."""
 
 import json
 import logging

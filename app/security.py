@@ -1,4 +1,4 @@
-"""Who may come in: one ASGI middleware in front of every http request and websocket."""
+"""Access control: one ASGI middleware in front of every http request and websocket."""
 
 import base64
 import hashlib
@@ -41,7 +41,7 @@ LOOKING = (
     ("POST", "/api/v1/runs/check"),
     ("POST", f"/api/v1/runs/{_ID}/(export|replay)"),
 )
-"""What who may only look asks for by other methods than GET: live scenes of one's own, in which
+"""Requests by other methods than GET that read-only access allows: own live scenes, in which
 nothing can be kept, and files. All else is refused, so that a new route is guarded by itself."""
 _LOOKING = tuple((method, re.compile(path)) for method, path in LOOKING)
 
@@ -84,11 +84,11 @@ READ_ONLY = (
     "You may only look here. Open the server's full address, or ask who runs it, to launch, "
     "change, share or delete."
 )
-"""What who may only look is told."""
+"""Message to a visitor with read-only access whose request is refused."""
 PROBES = frozenset({"/healthz", "/readyz"})
-"""What answers everybody, and tells nothing of anybody; see `app.health`."""
+"""Paths that are open to everybody and reveal nothing; see `app.health`."""
 SHARED = "/shared/"
-"""Where pages are that can be looked at without the token; see `app.exports.shares`."""
+"""Path below which pages can be read without the token; see `app.exports.shares`."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ class Security:
             OSError: If a file can neither be read nor made.
         """
         given = settings.token.get_secret_value() if settings.token else None
-        kept = read_or_make_token(settings.token_file) if settings.token_file else None
-        self.token = given or kept or secrets.token_urlsafe(32)
+        stored = read_or_make_token(settings.token_file) if settings.token_file else None
+        self.token = given or stored or secrets.token_urlsafe(32)
         only = settings.read_only_token_file
         self.read_only_token = read_or_make_token(only) if only else None
         if self.read_only_token == self.token:
@@ -171,10 +171,10 @@ class Security:
 
     def is_known_host(self, host: str) -> bool:
         """Check a Host header against the allow-list, against DNS rebinding."""
-        found = _HOST.fullmatch(host.lower())
-        if found is None:
+        match = _HOST.fullmatch(host.lower())
+        if match is None:
             return False
-        return found[1] in self._hosts or (self._any_host and _is_address(found[1]))
+        return match[1] in self._hosts or (self._any_host and _is_address(match[1]))
 
     def count_wrong(self, client: str) -> bool:
         """Note a wrong token or cookie; returns whether one client sent too many in a minute."""
@@ -370,7 +370,7 @@ def only_looks(scope: Scope) -> bool:
     if method in _SAFE_METHODS:
         return True
     path = scope["path"]
-    return any(method == known and pattern.fullmatch(path) for known, pattern in _LOOKING)
+    return any(method == allowed and pattern.fullmatch(path) for allowed, pattern in _LOOKING)
 
 
 def _is_probe(scope: Scope) -> bool:

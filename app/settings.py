@@ -181,14 +181,14 @@ class ServerSettings(BaseSettings):
     @field_validator("engine")
     @classmethod
     def _is_engine(cls, value: str) -> str:
-        found = _CLUSTER.fullmatch(value)
-        if value != LOCAL and (found is None or not 0 < int(found[2]) < 65_536):
+        match = _CLUSTER.fullmatch(value)
+        if value != LOCAL and (match is None or not 0 < int(match[2]) < 65_536):
             raise ValueError(
                 f"{value!r} is no engine; give local, or ray://HOST:PORT with the address of a "
                 "cluster's Jobs API"
             )
         # A name may stand for another address by then, so it is looked at when it is called.
-        host = "localhost" if found is None else found[1]
+        host = "localhost" if match is None else match[1]
         is_name = host[-1].isalpha()
         if not is_name and not is_private(host):
             raise ValueError(

@@ -83,8 +83,8 @@ class ImpatientProtocol(H11Protocol):
         cycle = self.cycle
         is_answered = part == "body" and cycle.response_started
         if not is_answered:
-            told = f"The {part} of the request did not arrive in time."
-            content = json.dumps({"error": {"code": "too_slow", "message": told}}).encode()
+            message = f"The {part} of the request did not arrive in time."
+            content = json.dumps({"error": {"code": "too_slow", "message": message}}).encode()
             headers = [
                 ("content-type", "application/json"),
                 ("content-length", str(len(content))),

@@ -29,16 +29,16 @@ def two_springs(frames: int = 4) -> ObjectRollout:
     )
 
 
-def content_of(take: ObjectRollout, **fields) -> Content:
+def content_of(rollout: ObjectRollout, **fields) -> Content:
     return Content(
         title="t",
         sequence_name="s",
-        frame_count=take.frame_count,
+        frame_count=rollout.frame_count,
         frame_rate=30.0,
-        reconstruction_count=take.frame_count,
+        reconstruction_count=rollout.frame_count,
         length_unit="m",
         ground_height=0.0,
-        control=take.control,
-        fitted=take,
+        control=rollout.control,
+        fitted=rollout,
         **fields,
     )

@@ -1,1 +1,1 @@
-"""What the running application is measured with."""
+"""Benchmarks of the running application."""

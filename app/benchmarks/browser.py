@@ -1,4 +1,4 @@
-"""What a person sees in a real browser, and when: the home page, a live scene and its slider."""
+"""Delays in a real browser: the home page, a live scene and its slider."""
 
 import json
 import re
@@ -227,9 +227,9 @@ def measure_slider_in_browser(
             scene.evaluate(_EXPECT, json.dumps([*pair, TOLERANCE]))
             _press(page, scene, slider, move)
             scene.wait_for_function("() => window.physhandiWatch.drawn > 0", polling=_POLLING_MS)
-            told = scene.evaluate("() => window.physhandiWatch")
-            arrived.append(1e-3 * (told["arrived"] - told["pressed"]))
-            drawn.append(1e-3 * (told["drawn"] - told["pressed"]))
+            moments = scene.evaluate("() => window.physhandiWatch")
+            arrived.append(1e-3 * (moments["arrived"] - moments["pressed"]))
+            drawn.append(1e-3 * (moments["drawn"] - moments["pressed"]))
             page.wait_for_timeout(300)
             before = move.shown
         rate = _rate(page, scene)

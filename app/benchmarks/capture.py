@@ -41,7 +41,7 @@ CAPTURE_GOALS: Mapping[str, float] = {
     "camera_turn_deg": 0.3,
     "chamfer_ratio": 1.25,
 }
-"""What an import is to reach: at least overlaps and living tracks, at most everything else."""
+"""Goals of an import: at least for overlaps and living tracks, at most for everything else."""
 _AT_LEAST = ("object_iou", "hand_iou", "tracks_alive", "tracks_alive_in_each_view")
 _MODULE = "app.benchmarks.capture"
 _RESULT = "capture.json"
@@ -54,7 +54,7 @@ _MILLIMETRES = 1e3
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureOrder:
-    """What is measured of every scene."""
+    """Options of the measurement of a scene."""
 
     image_size: CaptureSize = "half"
     """Size of the pictures."""
@@ -69,7 +69,7 @@ class CaptureOrder:
     device: str = "cpu"
     """Warp device of the fits; pictures are drawn there, too, if Warp has no CPU device."""
     resolution: Literal["fine", "tiny"] = "fine"
-    """How many nodes the bodies get; ``tiny`` is for tests."""
+    """Size of the bodies in nodes; ``tiny`` is for tests."""
 
 
 def benchmark_capture(
@@ -154,13 +154,13 @@ def _tell(line: str) -> None:
 def _chosen(scenes: tuple[str, ...]) -> tuple[str, ...]:
     from physhandi.synthetic.suite.suite import find_suite
 
-    known = [f"{one.object_}/{one.action}" for one in find_suite("dev_rgbd").scenes]
+    offered = [f"{one.object_}/{one.action}" for one in find_suite("dev_rgbd").scenes]
     for scene in scenes:
-        if scene not in known:
-            raise UsageError(f"There is no scene '{scene}'. Choose from: {', '.join(known)}.")
+        if scene not in offered:
+            raise UsageError(f"There is no scene '{scene}'. Choose from: {', '.join(offered)}.")
         if scenes.count(scene) > 1:
             raise UsageError(f"Scene '{scene}' is named twice.")
-    return scenes or tuple(known)
+    return scenes or tuple(offered)
 
 
 def _shared_threads(jobs: int) -> int:
@@ -169,7 +169,7 @@ def _shared_threads(jobs: int) -> int:
 
 
 class ScenePlace:
-    """Where the files of a scene are; sequences have one name, by which runs are compared."""
+    """Paths of a scene's files; sequences have one name, by which runs are compared."""
 
     def __init__(self, folder: Path, scene: str, seed: int) -> None:
         self.name = f"{scene.replace('/', '_')}_{seed}"
@@ -211,11 +211,11 @@ class _Steps:
                 _MODULE, json.dumps({"step": step, "scene": scene, **about}), threads=self._threads
             )
             self._children.add(child)
-        found: dict[str, Any] | None = None
+        result: dict[str, Any] | None = None
         try:
             for message in child.messages():
                 if "found" in message:
-                    found = message["found"]
+                    result = message["found"]
                 else:
                     stage = f"{scene}: {label}: {message['stage']}"
                     lines.report(stage, message["iteration"], message["total"])
@@ -225,9 +225,9 @@ class _Steps:
             with self._lock:
                 self._children.discard(child)
             child.close()
-        if found is None:
+        if result is None:
             raise RunError(f"{label}: its process ended without a result.")
-        return found | {"step_seconds": time.monotonic() - begin}
+        return result | {"step_seconds": time.monotonic() - begin}
 
     def end(self) -> None:
         """Kill what runs, and start nothing more."""
@@ -256,18 +256,18 @@ def _measured(scene: str, folder: Path, order: CaptureOrder, steps: _Steps) -> d
     """Measure a scene, step by step."""
     do = partial(steps.do, scene, folder=str(folder), order=asdict(order))
     seconds: dict[str, float] = {}
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for step in ("make", "import", "score"):
         of_step = do(step)
         seconds[step] = of_step.pop("step_seconds")
-        found |= of_step
-    found |= {"seconds": seconds, "reached": reached(found)}
-    write_json(folder / _RESULT, found)  # Fits take longest, and may be the last that is tried.
+        result |= of_step
+    result |= {"seconds": seconds, "reached": reached(result)}
+    write_json(folder / _RESULT, result)  # Fits take longest, and may be the last that is tried.
     if order.fit != "none":
-        found |= _fitted(do, order, seconds)
-        found["reached"] = reached(found)
-        write_json(folder / _RESULT, found)
-    return found
+        result |= _fitted(do, order, seconds)
+        result["reached"] = reached(result)
+        write_json(folder / _RESULT, result)
+    return result
 
 
 def _fitted(
@@ -310,32 +310,32 @@ def ratios(fits: Mapping[str, Many[Mapping[str, Any]]]) -> dict[str, dict[str, f
     Returns:
         For both kinds of frames each metric's ratio; None if an input has no scored fit.
     """
-    found: dict[str, dict[str, float | None]] = {}
+    by_split: dict[str, dict[str, float | None]] = {}
     for split in _SPLITS:
-        found[split] = {}
+        by_split[split] = {}
         for metric in _METRICS:
             name = f"{metric}_mm"
             values = [
                 [one[split][name] for one in fits[given] if "error" not in one] for given in _INPUTS
             ]
             is_known = all(of_input and None not in of_input for of_input in values)
-            found[split][metric] = fmean(values[0]) / fmean(values[1]) if is_known else None
-    return found
+            by_split[split][metric] = fmean(values[0]) / fmean(values[1]) if is_known else None
+    return by_split
 
 
-def reached(found: Mapping[str, Any]) -> dict[str, bool]:
+def reached(result: Mapping[str, Any]) -> dict[str, bool]:
     """Tell which of `CAPTURE_GOALS` a scene's figures reach; without fits, not that of fits."""
     values: dict[str, float | None] = {
-        "object_iou": found["masks"]["against_exact"]["object"],
-        "hand_iou": found["masks"]["against_exact"]["hand"],
-        "track_median_mm": found["tracks"]["median_mm"],
-        "tracks_alive": found["tracks"]["least"],
-        "tracks_alive_in_each_view": min(found["tracks"]["least_by_view"], default=0),
-        "camera_shift_mm": found["cameras"]["shift_mm"],
-        "camera_turn_deg": found["cameras"]["turn_deg"],
+        "object_iou": result["masks"]["against_exact"]["object"],
+        "hand_iou": result["masks"]["against_exact"]["hand"],
+        "track_median_mm": result["tracks"]["median_mm"],
+        "tracks_alive": result["tracks"]["least"],
+        "tracks_alive_in_each_view": min(result["tracks"]["least_by_view"], default=0),
+        "camera_shift_mm": result["cameras"]["shift_mm"],
+        "camera_turn_deg": result["cameras"]["turn_deg"],
     }
-    if "ratio" in found:
-        values["chamfer_ratio"] = found["ratio"]["fitted"]["chamfer_l1"]
+    if "ratio" in result:
+        values["chamfer_ratio"] = result["ratio"]["fitted"]["chamfer_l1"]
     return {
         name: value is not None
         and (value >= CAPTURE_GOALS[name] if name in _AT_LEAST else value <= CAPTURE_GOALS[name])
@@ -549,8 +549,8 @@ def score_fit(
         values = report.get(split, {}).get("rollout", {})
         scores[name] = {f"{metric}_mm": _in_mm(values.get(metric)) for metric in _METRICS}
     hands = [_in_mm(hand.get("mpjpe")) for hand in report.get("hands", {}).values()]
-    known = [error for error in hands if error is not None]
-    return scores | {"hand_mpjpe_mm": fmean(known) if known else None}
+    errors = [error for error in hands if error is not None]
+    return scores | {"hand_mpjpe_mm": fmean(errors) if errors else None}
 
 
 def _in_mm(value: float | None) -> float | None:

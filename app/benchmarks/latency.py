@@ -1,4 +1,4 @@
-"""How long the live simulation process takes from a slider to the first new frame."""
+"""Latency of the live simulation process from a slider to the first new frame."""
 
 import queue
 import time
@@ -17,7 +17,7 @@ from physhandi.devices import start_warp
 from physhandi.errors import MissingInputError, SimulationError
 from physhandi.object_rollout import ObjectRollout, load_fitted
 from physhandi.run import Run
-from physhandi.simulation.steering import SteeredHand, Take
+from physhandi.simulation.steering import SteeredHand, SteeredMotion
 
 _SESSION = "latency"
 _PATIENCE = 120.0
@@ -26,14 +26,14 @@ _FARTHEST = 0.12
 _STEERED, _TURNS_AFTER = 240, 20
 """Frames that are steered, and after how many the hand turns round."""
 _LIFT = 0.5
-"""How far the hand goes up, in extents of what holds the object."""
+"""Height to which the hand goes up, in extents of what holds the object."""
 MOVES = 12
 """Slider positions of each kind that are asked for."""
 
 
 @dataclass(frozen=True)
 class _Answer:
-    """What the process said to one request, and when [s after the request]."""
+    """Messages of the process after one request, and their times [s after the request]."""
 
     seconds: list[float]
     messages: list[Message]
@@ -62,7 +62,7 @@ class _Slider:
         live.subscribe(_SESSION, lambda message: self._inbox.put((time.perf_counter(), message)))
 
     def ask(
-        self, take: ObjectRollout, *, automatic: bool, to_the_end: bool, **changes: float
+        self, rollout: ObjectRollout, *, automatic: bool, to_the_end: bool, **changes: float
     ) -> _Answer:
         """Ask once and listen.
 
@@ -75,7 +75,7 @@ class _Slider:
             LiveRequest(
                 run=self._run.folder,
                 sequence=self._sequence,
-                parameters=take.parameters.replace(**changes),
+                parameters=rollout.parameters.replace(**changes),
                 automatic_substeps=automatic,
             ),
         )
@@ -104,7 +104,7 @@ class _Slider:
         every = np.arange(len(control))
         hand = SteeredHand(name="hand", control=every, wrist=control.mean(axis=0))
         model, start = rollout.going_on(0)
-        begun = Take(
+        begun = SteeredMotion(
             model=model,
             start=start,
             parameters=rollout.parameters,
@@ -178,22 +178,22 @@ def measure_latency(
         SimulationError: If the process cannot simulate it, dies, or says nothing.
     """
     start_warp()
-    take = load_fitted(run, sequence)
-    if take is None:
+    rollout = load_fitted(run, sequence)
+    if rollout is None:
         raise MissingInputError(f"Run '{run.name}' has no object in '{sequence}' to simulate.")
     about = describe_machine(device)
     live = SimulationClient(device)
     try:
         slider = _Slider(live, run, sequence)
-        started = slider.ask(take, automatic=False, to_the_end=True)
+        started = slider.ask(rollout, automatic=False, to_the_end=True)
         kinds = {
             f"{name}, substeps {'automatic' if automatic else 'as fitted'}": _drag(
-                slider, take, field, moves, automatic=automatic
+                slider, rollout, field, moves, automatic=automatic
             )
             for automatic in (False, True)
             for name, field in (("stiffness", "stiffness_scale"), ("radius", "connection_radius"))
         }
-        steered = _steered(*slider.steer(take, _STEERED))
+        steered = _steered(*slider.steer(rollout, _STEERED))
     finally:
         live.close()
     heard = [seconds for kind in kinds.values() for seconds in kind.pop("heard")]
@@ -202,10 +202,10 @@ def measure_latency(
         "benchmark": "live",
         **about,
         "scene": f"{run.name}: {sequence}",
-        "nodes": take.model.node_count,
-        "springs": len(take.model.spring_nodes),
-        "frames": take.frame_count - 1,
-        "sequence_frames_per_s": take.parameters.frame_rate,
+        "nodes": rollout.model.node_count,
+        "springs": len(rollout.model.spring_nodes),
+        "frames": rollout.frame_count - 1,
+        "sequence_frames_per_s": rollout.parameters.frame_rate,
         "start_ms": 1e3 * started.first("frame", 1),
         **_to_first_frame(heard, computed),
         "kinds": kinds,
@@ -215,8 +215,8 @@ def measure_latency(
 
 def _steered(moments: Sequence[float], durations: Sequence[float]) -> dict[str, float]:
     """Say how fast frames came while hands were steered, the first ones left out."""
-    kept = slice(_STEERED // 4, None)
-    came, took = moments[kept], durations[kept]
+    counted = slice(_STEERED // 4, None)
+    came, took = moments[counted], durations[counted]
     return {
         "ms_per_frame": 1e3 * median(took),
         "p95_ms_per_frame": 1e3 * float(np.quantile(took, 0.95)),
@@ -225,15 +225,15 @@ def _steered(moments: Sequence[float], durations: Sequence[float]) -> dict[str, 
 
 
 def _drag(
-    slider: _Slider, take: ObjectRollout, field: str, moves: int, *, automatic: bool
+    slider: _Slider, rollout: ObjectRollout, field: str, moves: int, *, automatic: bool
 ) -> dict[str, Any]:
     """Move one slider several times, then let the last rollout end."""
-    fitted = getattr(take.parameters, field)
+    fitted = getattr(rollout.parameters, field)
     answers: list[_Answer] = []
     for move in range(moves):
         changes = {field: fitted * (1.0 + _FARTHEST * (move + 1) / moves)}
         is_last = move == moves - 1
-        answers.append(slider.ask(take, automatic=automatic, to_the_end=is_last, **changes))
+        answers.append(slider.ask(rollout, automatic=automatic, to_the_end=is_last, **changes))
     heard = [answer.first("frame", 1) for answer in answers]
     computed = [answer.computed(1) for answer in answers]
     last = answers[-1]

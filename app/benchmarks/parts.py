@@ -1,4 +1,4 @@
-"""What can be measured on its own, and choices of the benchmarks' commands."""
+"""Parts of the benchmarks, and choices of their commands."""
 
 from typing import Literal, get_args
 

@@ -1,4 +1,4 @@
-"""What the viewer's benchmark shows: a heavy scene, and a folder with many runs."""
+"""Scenes of the viewer's benchmark: a heavy scene, and a folder with many runs."""
 
 import shutil
 from pathlib import Path

@@ -2,9 +2,6 @@
 
 import http.client
 import json
-import subprocess
-import tempfile
-import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,14 +12,14 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 
 from app.benchmarks.viewer_client import ViewerClient
-from physhandi.child import start_module
 from physhandi.errors import PhysHandiError
+from physhandi.viewer_process import ServerProcess
 
 _PATIENCE = 120.0
 
 
 class ServerFailedError(PhysHandiError):
-    """The server that was to be measured did not start, or did not do what it was asked."""
+    """The server that was to be measured did not do what it was asked."""
 
 
 class Served:
@@ -44,23 +41,12 @@ class Served:
             environment: More environment variables.
 
         Raises:
-            ServerFailedError: If it does not start; says what it wrote.
+            RunError: If it does not start; says what it wrote.
         """
-        options = ["--port", "0", "--data-dir", str(data_dir.resolve()), "--device", device]
-        self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the server
         start = time.perf_counter()
-        self._process = start_module(
-            "app.cli",
-            "serve",
-            *options,
-            environment=environment,
-            without_settings=True,
-            outlives_parent=True,
-            stdout=subprocess.PIPE,
-            stderr=self._said,
-        )
-        self.url = self._printed()
+        self._server = ServerProcess(data_dir, "--device", device, environment=environment)
         self.start_seconds = time.perf_counter() - start
+        self.url = self._server.url
         address = urlsplit(self.url)
         self._host = f"{address.hostname}:{address.port}"
         self._headers = {"Authorization": f"Bearer {parse_qs(address.query)['token'][0]}"}
@@ -74,16 +60,16 @@ class Served:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._end()
+        self._server.stop()
 
     @property
     def process_id(self) -> int:
         """Process id of the server."""
-        return self._process.pid
+        return self._server.process_id
 
     def cpu_seconds(self) -> float:
         """Time that the server and its child processes have kept a processor busy [s]."""
-        server = psutil.Process(self._process.pid)
+        server = psutil.Process(self.process_id)
         times = [process.cpu_times() for process in (server, *server.children(recursive=True))]
         return sum(t.user + t.system for t in times)
 
@@ -132,29 +118,3 @@ class Served:
         if not 200 <= answer.status < 300:
             raise ServerFailedError(f"{method} {path} was answered with {answer.status}.")
         return seconds, received
-
-    def _printed(self) -> str:
-        timer = threading.Timer(_PATIENCE, self._process.kill)
-        timer.start()
-        output = self._process.stdout
-        line = "" if output is None else output.readline().strip()
-        timer.cancel()
-        if line.startswith("http"):
-            return line
-        self._process.kill()
-        self._process.wait()
-        self._said.seek(0)
-        said = self._said.read()[-2000:]
-        self._end()
-        raise ServerFailedError(f"The server did not start: {said.strip() or 'it said nothing'}")
-
-    def _end(self) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(20)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-        self._said.close()

@@ -1,4 +1,4 @@
-"""How long it takes from a slider of a live scene to the first new frame, without a browser."""
+"""Latency from a slider of a live scene to the first new frame, without a browser."""
 
 import time
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Move:
     value: float
     """Value on the slider."""
     shown: Float[ndarray, "frame vertex 3"]
-    """Where the object's surface is [m], simulated by the benchmark itself."""
+    """Positions of the object's surface [m], simulated by the benchmark itself."""
 
 
 class MeasuredSlider:
@@ -61,7 +61,7 @@ class MeasuredSlider:
 
     @property
     def fitted(self) -> Float[ndarray, "frame node 3"]:
-        """Where the surface is in the fitted rollout [m]."""
+        """Positions of the surface in the fitted rollout [m]."""
         return shown_places(self._run, self._fitted.fitted)
 
     def moves(self, count: int) -> list[Move]:

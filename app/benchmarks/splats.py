@@ -1,4 +1,4 @@
-"""How an object is shown as splats: pictures a second in a browser, bytes and work of a frame."""
+"""Speed of an object shown as splats: pictures a second in a browser, bytes and work of a frame."""
 
 import itertools
 import threading
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 COUNTS = (1_000, 5_000, 20_000)
 """Numbers of splats that are shown."""
 BUDGETED = "splats_5000"
-"""What is held against the goals."""
+"""Name of the scene that is compared with the goals."""
 _RATE = 30.0
 _OVERLAP = 0.7
 """Deviation of a made splat, in distances between splats."""
@@ -87,12 +87,12 @@ def measure_splats(
     for count in counts:
         splats = scattered(content.surface, content.fitted.position[0], count)
         kinds[f"splats_{count}"] = "splats", splats
-    found = {
+    measured = {
         name: _measure(replace(content, splats=splats), content.fitted, form, browser, seconds)
         for name, (form, splats) in kinds.items()
     }
-    held = found.get(BUDGETED, found[f"splats_{max(counts)}"])
-    return {"frame_bytes": held["frame_bytes"], "server_ms": held["server_ms"], "kinds": found}
+    held = measured.get(BUDGETED, measured[f"splats_{max(counts)}"])
+    return {"frame_bytes": held["frame_bytes"], "server_ms": held["server_ms"], "kinds": measured}
 
 
 def scattered(surface: ObjectSurface, node: np.ndarray, count: int) -> Splats:
@@ -122,7 +122,7 @@ def scattered(surface: ObjectSurface, node: np.ndarray, count: int) -> Splats:
 
 
 def _measure(
-    content: Content, take: ObjectRollout, form: ObjectForm, browser: "Browser", seconds: float
+    content: Content, rollout: ObjectRollout, form: ObjectForm, browser: "Browser", seconds: float
 ) -> Mapping[str, float]:
     server = start_viser("splats")
     try:
@@ -131,24 +131,24 @@ def _measure(
             setattr(scene.layers, one, one == form)
         scene.layers.controls = scene.layers.virtual_springs = False
         scene.layers.object_springs = False
-        scene.draw(0, take, 0, is_playing=True)
-        sent = _measure_sending(server, scene, take)
-        return sent | {"pictures_per_s": _measure_drawing(server, scene, take, browser, seconds)}
+        scene.draw(0, rollout, 0, is_playing=True)
+        sent = _measure_sending(server, scene, rollout)
+        return sent | {"pictures_per_s": _measure_drawing(server, scene, rollout, browser, seconds)}
     finally:
         server.stop()
 
 
 def _measure_sending(
-    server: viser.ViserServer, scene: SceneDrawing, take: ObjectRollout
+    server: viser.ViserServer, scene: SceneDrawing, rollout: ObjectRollout
 ) -> dict[str, float]:
     """Play all frames once to a client that only reads afterwards."""
     with ViewerClient(f"ws://127.0.0.1:{server.get_port()}", remembers=False) as client:
         _hear_all(server, client)
         before, busy, drawn = client.bytes_received, time.process_time(), 0.0
-        count = take.ready - 1
+        count = rollout.ready - 1
         for frame in range(1, count + 1):
             start, own = time.monotonic(), time.thread_time()
-            scene.draw(frame, take, frame, is_playing=True)
+            scene.draw(frame, rollout, frame, is_playing=True)
             drawn += time.thread_time() - own
             time.sleep(max(1 / _RATE - (time.monotonic() - start), 0.0))
         busy = time.process_time() - busy
@@ -171,7 +171,7 @@ def _hear_all(server: viser.ViserServer, client: ViewerClient) -> None:
 def _measure_drawing(
     server: viser.ViserServer,
     scene: SceneDrawing,
-    take: ObjectRollout,
+    rollout: ObjectRollout,
     browser: "Browser",
     seconds: float,
 ) -> float:
@@ -179,8 +179,8 @@ def _measure_drawing(
     is_over = threading.Event()
 
     def play() -> None:
-        for frame in itertools.cycle(range(take.ready)):
-            scene.draw(frame, take, frame, is_playing=True)
+        for frame in itertools.cycle(range(rollout.ready)):
+            scene.draw(frame, rollout, frame, is_playing=True)
             if is_over.wait(1 / _RATE):
                 return
 

@@ -1,4 +1,4 @@
-"""What a client without a browser gets from live scenes, and when."""
+"""Streams of live scenes to a client without a browser, and their timing."""
 
 import threading
 import time
@@ -25,7 +25,7 @@ def percentiles(seconds: list[float]) -> dict[str, float]:
 
 
 class Screen:
-    """What one client sees of an object that plays."""
+    """Frames of a playing object that one client gets."""
 
     def __init__(self, client: ViewerClient) -> None:
         self.client = client
@@ -39,7 +39,7 @@ class Screen:
 
     @property
     def positions(self) -> Float[ndarray, "vertex 3"]:
-        """Where the object's surface is on the screen [m]."""
+        """Positions of the shown surface of the object [m]."""
         return self.client.array(_SURFACE, "vertices")
 
     def play(self, *, on: bool) -> None:
@@ -119,7 +119,7 @@ def measure_scrub(
 
 @dataclass
 class _Received:
-    """What one client received while a scene played."""
+    """Messages and times that one client received while a scene played."""
 
     frames: list[int] = field(default_factory=list[int])
     sizes: list[int] = field(default_factory=list[int])

@@ -43,12 +43,12 @@ _LISTS = ("/", "/runs", "/api/v1/runs")
 
 @dataclass(frozen=True)
 class Goal:
-    """What a figure is to reach."""
+    """Goal of a figure."""
 
     part: Part
-    """Which part measures it."""
+    """Part that measures it."""
     path: tuple[str, ...]
-    """Where the figure stands in what the part returns."""
+    """Keys of the figure in the part's result."""
     limit: float
     """The goal."""
     is_least: bool = False
@@ -76,7 +76,7 @@ GOALS: Mapping[str, Goal] = {
 
 @dataclass(frozen=True)
 class _Effort:
-    """How often things are repeated."""
+    """Numbers of repetitions."""
 
     moves: int
     visits: int
@@ -105,7 +105,8 @@ def measure_viewer(
 
     Raises:
         MissingInputError: If the run has no object there, or a browser is asked for and missing.
-        ServerFailedError: If the server does not start or does not do what it is asked.
+        RunError: If the server does not start.
+        ServerFailedError: If it does not do what it is asked.
     """
     start_warp()
     about = describe_machine("cpu")
@@ -117,7 +118,7 @@ def measure_viewer(
         tempfile.TemporaryDirectory(prefix="physhandi_benchmark_") as folder,
         _Bench(run, sequence, Path(folder), effort) as bench,
     ):
-        found = {part: bench.measure(part) for part in PARTS if part in parts}
+        results = {part: bench.measure(part) for part in PARTS if part in parts}
     return {
         "benchmark": "viewer",
         **about,
@@ -125,25 +126,25 @@ def measure_viewer(
         "cpu_count": os.cpu_count(),
         "scene": f"{run.name}: {sequence}",
         "is_quick": is_quick,
-        "figures": compare_with_goals(found),
-        **found,
+        "figures": compare_with_goals(results),
+        **results,
     }
 
 
-def compare_with_goals(found: Mapping[Part, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def compare_with_goals(results: Mapping[Part, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Hold what was measured against the goals.
 
     Args:
-        found: What each part returned.
+        results: What each part returned.
 
     Returns:
         For each figure of these parts its ``value``, ``goal``, and whether it is ``reached``.
     """
     figures: dict[str, dict[str, Any]] = {}
     for name, goal in GOALS.items():
-        if goal.part not in found:
+        if goal.part not in results:
             continue
-        value: Any = found[goal.part]
+        value: Any = results[goal.part]
         for key in goal.path:
             value = value[key]
         is_reached = value >= goal.limit if goal.is_least else value < goal.limit
@@ -245,14 +246,14 @@ class _Bench:
     def _start(self) -> dict[str, Any]:
         slider = MeasuredSlider(self._run, self._sequence, FIELDS[0])
         moves = slider.moves(2)
-        found: dict[str, Any] = {}
+        measured: dict[str, Any] = {}
         with Served(self._data("fresh")) as served:
-            found |= measure_first_move(served, self._run.id, slider, moves)
+            measured |= measure_first_move(served, self._run.id, slider, moves)
         # Nothing compiled before is found in an empty cache.
         empty = {"WARP_CACHE_PATH": str(self._folder / "kernels")}
         with Served(self._data("fresh"), environment=empty) as served:
-            found["nothing_compiled"] = measure_first_move(served, self._run.id, slider, moves)
-        return found
+            measured["nothing_compiled"] = measure_first_move(served, self._run.id, slider, moves)
+        return measured
 
     def _heavy(self, count: int) -> dict[str, Any]:
         data = self._folder / "heavy"
@@ -272,16 +273,20 @@ class _Bench:
     def _many_runs(self) -> dict[str, Any]:
         data = self._data("many")
         make_many_runs(data / "runs", self._effort.runs)
-        found: dict[str, Any] = {"runs": self._effort.runs}
+        measured: dict[str, Any] = {"runs": self._effort.runs}
         with Served(data) as served:
-            found["first_ms"] = 1e3 * served.get(_LISTS[0])[0]
+            measured["first_ms"] = 1e3 * served.get(_LISTS[0])[0]
             for path in _LISTS:
                 busy = served.cpu_seconds()
                 seconds = [served.get(path)[0] for _ in range(2 * self._effort.visits)]
                 busy = (served.cpu_seconds() - busy) / len(seconds)
                 size = len(served.get(path)[1])
-                found[path] = {**percentiles(seconds), "server_cpu_ms": 1e3 * busy, "bytes": size}
-        return {**found, "worst_p95_ms": max(found[path]["p95_ms"] for path in _LISTS)}
+                measured[path] = {
+                    **percentiles(seconds),
+                    "server_cpu_ms": 1e3 * busy,
+                    "bytes": size,
+                }
+        return {**measured, "worst_p95_ms": max(measured[path]["p95_ms"] for path in _LISTS)}
 
     def _splats(self) -> dict[str, Any]:
         from app.benchmarks.splats import measure_splats

@@ -118,7 +118,7 @@ class ViewerClient:
         labels = (
             (uuid, str(props.get("label")).removeprefix("● ")) for uuid, props in self.gui.items()
         )
-        return next((uuid for uuid, known in labels if known == label), "")
+        return next((uuid for uuid, name in labels if name == label), "")
 
     def value(self, label: str) -> Any:
         """The value of a slider, box or choice."""
@@ -213,8 +213,8 @@ def _fill_in(value: dict[Any, Any] | list[Any], buffers: list[bytes]) -> None:
     )
     for key, inner in entries:
         if isinstance(inner, dict) and "__binary_index" in inner:
-            found = cast("dict[str, Any]", inner)
-            index = int(found["__binary_index"])
-            value[key] = np.frombuffer(buffers[index], found["dtype"])
+            reference = cast("dict[str, Any]", inner)
+            index = int(reference["__binary_index"])
+            value[key] = np.frombuffer(buffers[index], reference["dtype"])
         elif isinstance(inner, dict | list):
             _fill_in(cast("dict[Any, Any] | list[Any]", inner), buffers)

@@ -1,4 +1,4 @@
-"""What `physhandi doctor` says of a data folder, and `physhandi reindex`."""
+"""Checks of a data folder by `physhandi doctor`, and `physhandi reindex`."""
 
 import os
 from collections.abc import Iterator
@@ -28,12 +28,12 @@ def reindex(*, data_dir: DataDir = None, as_json: AsJson = False) -> None:
     catalog = Catalog(settings)
     catalog.reindex()
     damaged = damaged_folders(catalog, Scheduler(settings, catalog))
-    found = {
+    report = {
         "index": str(settings.index_path),
         "runs": sum(item.run is not None and not item.is_bundled for item in catalog.runs()),
         "damaged": {f"{folder.kind}/{folder.id}": folder.why for folder in damaged},
     }
-    show(found, as_json=as_json)
+    show(report, as_json=as_json)
 
 
 def look_through(data_dir: Path | None) -> Iterator[tuple[bool, str]]:

@@ -1,4 +1,4 @@
-"""What commands print: results as lines or JSON, and options that several commands share."""
+"""Output of commands: results as lines or JSON, and options that several commands share."""
 
 import json
 from collections.abc import Iterator, Mapping

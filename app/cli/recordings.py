@@ -38,19 +38,19 @@ def check(
         raise UsageError("Name at least one sequence to check.")
     reports: dict[str, dict[str, Any]] = {}
     for name in sequences:
-        found = RecordingCheck(stages={}, problems=())
+        result = RecordingCheck(stages={}, problems=())
         try:
             folder = folder_of_sequence(name, data_dir)
             with watched(True) as progress:
-                found = check_recording(folder, progress)
+                result = check_recording(folder, progress)
             sequence = Sequence.load(folder)
         except PhysHandiError as error:
-            reports[name] = {"error": str(error), **_told(found, as_json=as_json)}
+            reports[name] = {"error": str(error), **_check_report(result, as_json=as_json)}
             continue
-        if found.error is not None:
-            reports[name] = {"error": found.error, **_told(found, as_json=as_json)}
+        if result.error is not None:
+            reports[name] = {"error": result.error, **_check_report(result, as_json=as_json)}
             continue
-        of_hands, of_object = found.stages[HANDS], found.stages[OBSERVATION]
+        of_hands, of_object = result.stages[HANDS], result.stages[OBSERVATION]
         reports[name] = {
             "folder": str(sequence.folder),
             "frames": sequence.frame_count,
@@ -59,7 +59,7 @@ def check(
             "hands": _use(of_hands) if sequence.hands else "not in it",
             "object": _use(of_object),
             "shape": sequence.shape or "is found by the fit",
-            **_told(found, as_json=as_json),
+            **_check_report(result, as_json=as_json),
         }
     only = next(iter(reports.values())) if as_json and len(reports) == 1 else {}
     show(
@@ -72,17 +72,17 @@ def _use(stage: StageReadiness) -> str:
     return "can be reconstructed" if stage.is_ready else f"lacks {', '.join(stage.missing)}"
 
 
-def _told(found: "RecordingCheck", *, as_json: bool) -> dict[str, Any]:
+def _check_report(result: "RecordingCheck", *, as_json: bool) -> dict[str, Any]:
     """Write what a check found for programs, or with a line for each stage and problem."""
     if as_json:
-        return found.to_dict()
+        return result.to_dict()
     problems = [
         f"{problem.level}: {problem.message}"
         + (f" To do: {problem.remedy}." if problem.remedy and problem.level == "warning" else "")
-        for problem in found.problems
-        if problem.message != found.error
+        for problem in result.problems
+        if problem.message != result.error
     ]
-    stages = {name: str(stage) for name, stage in found.stages.items()}
+    stages = {name: str(stage) for name, stage in result.stages.items()}
     return {"stages": stages, "problems": problems or None}
 
 
@@ -194,7 +194,14 @@ def annotate(
             track_model=track_model,
             trusts_model_code=trust_model_code,
         )
-    show({"sequence": str(done.folder), "masks": _found(done), **_method(done), **_doubts(done)})
+    show(
+        {
+            "sequence": str(done.folder),
+            "masks": _mask_counts(done),
+            **_method(done),
+            **_doubts(done),
+        }
+    )
 
 
 def _method(sequence: Sequence) -> dict[str, Any]:
@@ -207,24 +214,28 @@ def _doubts(sequence: Sequence) -> dict[str, Any]:
     """Tell what hands say of the scale of depth, if they doubt it."""
     from physhandi.fitting.checks.recording_check import depth_scale_problems
 
-    found = depth_scale_problems(sequence)
-    return {"problems": [f"{one.message} To do: {one.remedy}." for one in found]} if found else {}
+    problems = depth_scale_problems(sequence)
+    return (
+        {"problems": [f"{one.message} To do: {one.remedy}." for one in problems]}
+        if problems
+        else {}
+    )
 
 
-def _found(sequence: Sequence) -> dict[str, Any]:
+def _mask_counts(sequence: Sequence) -> dict[str, Any]:
     """Count, for each view with masks, the frames in which things and tracks were found."""
-    found: dict[str, Any] = {}
+    counts: dict[str, Any] = {}
     for view in sequence.views:
         if not view.has_mask:
             continue
         masks = [view.mask(frame) for frame in range(sequence.frame_count)]
         alive = None if view.track_visible is None else view.track_visible.sum(axis=1)
-        found[view.name] = {
+        counts[view.name] = {
             "frames with object": sum(bool((mask == 1).any()) for mask in masks),
             "frames with hands": sum(bool((mask > 1).any()) for mask in masks),
             "least tracks in a frame": None if alive is None else int(alive.min()),
         }
-    return found
+    return counts
 
 
 def _click(text: str) -> Any:
@@ -268,17 +279,17 @@ def shape(
         metres = None if scale == "auto" else float(scale)
     except ValueError:
         raise UsageError(f"--scale {scale!r} is neither a number nor auto.") from None
-    found = complete_shape(
+    completion = complete_shape(
         folder, mesh, scale=metres, pose=None if pose is None else RoughPose.parse(pose)
     )
     show(
         {
             "sequence": str(folder),
-            "scale": f"{found.scale:.6g} m for one unit",
-            "median distance": f"{1e3 * found.residual:.1f} mm from the cloud to the mesh",
-            "coverage": f"{100 * found.coverage:.0f} % of the cloud within "
-            f"{1e3 * found.tolerance:.0f} mm of it",
-            "outside": f"{100 * found.outside:.0f} % of its surface where views see nothing",
+            "scale": f"{completion.scale:.6g} m for one unit",
+            "median distance": f"{1e3 * completion.residual:.1f} mm from the cloud to the mesh",
+            "coverage": f"{100 * completion.coverage:.0f} % of the cloud within "
+            f"{1e3 * completion.tolerance:.0f} mm of it",
+            "outside": f"{100 * completion.outside:.0f} % of its surface where views see nothing",
         }
     )
 
@@ -535,16 +546,20 @@ def import_capture(
                     f"{error} The recording is imported as {sequence.folder}; click again with "
                     "physhandi annotate."
                 ) from None
-    told = ("depth_scale", "pairing", "calibration", "notes")
+    shown_fields = ("depth_scale", "pairing", "calibration", "notes")
     show(
         {
             "sequence": str(sequence.folder),
             "frames": sequence.frame_count,
             "frame_rate": sequence.frame_rate,
-            "masks": _found(sequence) if clicks else None,
+            "masks": _mask_counts(sequence) if clicks else None,
             **_method(sequence),
             **_doubts(sequence),
-            **{name: sequence.provenance[name] for name in told if sequence.provenance[name]},
+            **{
+                name: sequence.provenance[name]
+                for name in shown_fields
+                if sequence.provenance[name]
+            },
         }
     )
 

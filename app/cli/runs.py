@@ -112,13 +112,13 @@ def reconstruct(
     recordings = [find_sequence(name, data_dir) for name in sequences]
     for recording in recordings:
         recording.validate(reads_color=False)  # Tells wrong data before a run is made.
-    told = skipped_object(recordings)
-    if told is not None:
-        print(f"physhandi: warning: {told}", file=sys.stderr)
+    warning = skipped_object(recordings)
+    if warning is not None:
+        print(f"physhandi: warning: {warning}", file=sys.stderr)
     base = load_profile(profile)
     stored = fit_settings(base, dict(parse_override(text) for text in settings))
     server = read_settings(data_dir=data_dir, engine=engine, store=store)
-    kept = RunStore(server.store) if server.store else None
+    run_store = RunStore(server.store) if server.store else None
     if server.engine == LOCAL:
         cluster, devices = None, pick_devices(device)
     else:
@@ -129,7 +129,7 @@ def reconstruct(
     else:
         run = _run_at(out, "reconstruction", recordings, stored)
     if cluster is None:
-        show(_execute(run, *devices, store=kept))
+        show(_execute(run, *devices, store=run_store))
         return
     print(f"physhandi: {run.folder} is fitted on {cluster.name}", file=sys.stderr)
     with watched(True) as progress, FollowedRun(run.folder, cluster) as followed:
@@ -340,10 +340,10 @@ def gallery(
     """
     from app.exports.gallery import write_gallery
 
-    found = [find_result(name, data_dir) for name in runs]
+    results = [find_result(name, data_dir) for name in runs]
     with watched(True) as progress:
         index = write_gallery(
-            found,
+            results,
             out,
             open_catalog(data_dir),
             title=title,

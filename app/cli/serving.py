@@ -134,9 +134,9 @@ def _probes(data_dir: Path | None) -> Iterator[tuple[str, Callable[[], str]]]:
         from physhandi.hand.loading import load_hand_model
         from physhandi.hand.mano import hands_folder
 
-        found = [f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left")]
+        models = [f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left")]
         mano = [s for s in ("right", "left") if (hands_folder() / f"mano_{s}.npz").is_file()]
-        return ", ".join([*found, f"MANO: {' and '.join(mano) or 'not imported'}"])
+        return ", ".join([*models, f"MANO: {' and '.join(mano) or 'not imported'}"])
 
     def space() -> str:
         folder = read_settings(data_dir=data_dir).data_dir

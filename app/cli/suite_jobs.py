@@ -44,7 +44,7 @@ _INTERVAL_S = 0.2
 _TELL_EVERY_S = 0.5
 _BEAT_S = 5.0
 _SAME = ("device_name", "system", "python", "packages", "code")
-"""What all machines that compute cells of one table must have in common."""
+"""Properties that all machines that compute cells of one table must share."""
 
 
 class SuiteJobs:
@@ -154,7 +154,7 @@ class _StoredProgress(Progress):
         self._folder = folder
         self._lease = lease
         self._channel = channel
-        self._told = self._renewed = 0.0
+        self._written = self._renewed = 0.0
 
     def report(
         self,
@@ -166,10 +166,10 @@ class _StoredProgress(Progress):
     ) -> None:
         self._channel.step()
         clock = time.monotonic()
-        if total == 0 or clock - self._told >= _TELL_EVERY_S:
-            self._told = clock
-            told = {"stage": stage, "iteration": iteration, "total": total}
-            write_json(self._folder / PROGRESS, told, is_durable=False)
+        if total == 0 or clock - self._written >= _TELL_EVERY_S:
+            self._written = clock
+            state = {"stage": stage, "iteration": iteration, "total": total}
+            write_json(self._folder / PROGRESS, state, is_durable=False)
         if clock - self._renewed >= _BEAT_S:
             self._renewed = clock
             self._lease.heartbeat()

@@ -104,8 +104,8 @@ class SuiteProcesses:
                     yield piece.number, lost
                 else:
                     states[message[0]] = message[1]
-                told = " · ".join(states.values())
-                self._progress.report(stage, finished, len(pieces), message=told)
+                text = " · ".join(states.values())
+                self._progress.report(stage, finished, len(pieces), message=text)
         finally:
             for future in futures:
                 future.cancel()

@@ -26,9 +26,9 @@ class Piece:
     number: int
     """Index among its like."""
     label: str
-    """What it is, for people."""
+    """Its name for people."""
     request: Mapping[str, Any]
-    """What is to be done, in plain data; see `PieceWorker`."""
+    """The order, in plain data; see `PieceWorker`."""
     key: str
     """Stands for it in every command that wants the same."""
 

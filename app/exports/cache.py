@@ -52,7 +52,7 @@ class FileJob:
     of: int = 0
     """All steps; 0 before that is known."""
     last_used: float = field(default_factory=time.monotonic)
-    """When somebody asked for it."""
+    """Time of the last request for it [s, clock of `time.monotonic`]."""
 
     @property
     def state(self) -> Literal["making", "ready", "failed"]:
@@ -126,8 +126,8 @@ class FileCache:
         """Have a file made that nobody else will ask for.
 
         Args:
-            order: What is to be made; its `take` is replaced.
-            prepare: Puts a rollout into a folder, see `store_take`.
+            order: What is to be made; its `rollout` is replaced.
+            prepare: Puts a rollout into a folder, see `store_rollout`.
 
         Yields:
             The file, which is gone afterwards.
@@ -136,7 +136,7 @@ class FileCache:
         folder.mkdir(parents=True)
         try:
             prepare(folder)
-            whole = replace(order, take=str(folder))
+            whole = replace(order, rollout=str(folder))
             whole.check()
             out = folder / f"file.{order.suffix}"
             with self._lock:

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from app.exports.cache import FileCache, FileJob
 from app.exports.links import CLOSED, address, read_query
-from app.exports.making import store_take
+from app.exports.making import store_rollout
 from app.exports.permalink import state_from_query, state_to_query
 from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, Beside, FileRequest, Format
 from app.exports.schema import MEDIA_TYPES, SlowFormat, errors, files
@@ -73,15 +73,15 @@ class PictureOptions:
     turn: Turn = 0.0
     """Angle by which the camera goes round [degrees]."""
     camera_path: CameraPathField = ""
-    """How the camera of a film moves; docs/formats.md describes the JSON."""
+    """Camera path of a film; docs/formats.md describes the JSON."""
     view: FilmedFrom = ""
     """Camera of the recording from which a film is taken."""
     beside: Annotated[Beside | None, Query(description=_BESIDE)] = None
-    """What is beside such a film."""
+    """Picture beside such a film."""
 
 
 class FileProgress(BaseModel):
-    """How far a file is that is being made."""
+    """Progress of a file that is being made."""
 
     state: Literal["making", "ready", "failed"]
     """Whether it is being made, is there, or could not be made."""
@@ -206,10 +206,10 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
             query["theme"] = "dark"
         order = _order_of_scene(catalog, session, kind, query)
         order = replace(order, link=snapshot.link, **asdict(picture))
-        take = snapshot.rollout
-        if take is None:
+        rollout = snapshot.rollout
+        if rollout is None:
             return _answer(file_cache.make(order), session.target, order)
-        with file_cache.once(order, lambda folder: store_take(folder, take)) as path:
+        with file_cache.once(order, lambda folder: store_rollout(folder, rollout)) as path:
             return _attached(path.read_bytes(), _name(session.target, order), kind)
 
     return router

@@ -20,7 +20,7 @@ from physhandi.errors import UsageError
 from physhandi.run import Run
 
 GALLERY_FILE = "gallery.json"
-"""What tells a folder that holds a gallery, and what is in it."""
+"""File that marks a folder as a gallery and lists its contents."""
 _INDEX, _PAGES, _PICTURES = "index.html", "runs", "pictures"
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
@@ -36,7 +36,7 @@ _WAY_BACK = (
 
 @dataclass(frozen=True)
 class _Card:
-    """What the index says of a run."""
+    """Entry of the index for a run."""
 
     name: str
     note: str

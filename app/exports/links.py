@@ -33,9 +33,9 @@ class Link(BaseModel):
     query: str
     """Its part after the question mark."""
     lost: str = ""
-    """What is not in it, and what to do; empty if the address says all."""
+    """Note about what the address lacks, with advice; empty if it is complete."""
     camera_path: str = ""
-    """What the camera of a film of the scene follows, as JSON; empty if it stands still."""
+    """Camera path of a film of the scene, as JSON; empty if the camera stands still."""
     lacks_path: bool = False
     """Whether that has more key frames than a link holds, so that it is not in it."""
 

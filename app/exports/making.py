@@ -34,36 +34,36 @@ from physhandi.simulation.object_surface import ObjectSurface
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
 
-_ARRAYS, _PARAMETERS, _MODEL, _RESTART = "take.npz", "parameters.json", "model_", "restart_"
+_ARRAYS, _PARAMETERS, _MODEL, _RESTART = "rollout.npz", "parameters.json", "model_", "restart_"
 
 
-def store_take(folder: Path, take: ObjectRollout) -> None:
+def store_rollout(folder: Path, rollout: ObjectRollout) -> None:
     """Keep the frames of a rollout that are ready.
 
     Args:
         folder: Where to; must exist.
-        take: The rollout.
+        rollout: The rollout; later frames are left out.
     """
-    count = take.ready
+    count = rollout.ready
     arrays: dict[str, Any] = {
-        "position": np.asarray(take.position[:count]),
-        "control": np.asarray(take.control[:count]),
+        "position": np.asarray(rollout.position[:count]),
+        "control": np.asarray(rollout.control[:count]),
     }
-    if take.velocity is not None:
-        arrays["velocity"] = np.asarray(take.velocity[:count])
-    arrays |= {_MODEL + name: array for name, array in take.model.to_tensors().items()}
-    if take.restart is not None:
-        arrays |= {_RESTART + name: array for name, array in take.restart.to_tensors().items()}
+    if rollout.velocity is not None:
+        arrays["velocity"] = np.asarray(rollout.velocity[:count])
+    arrays |= {_MODEL + name: array for name, array in rollout.model.to_tensors().items()}
+    if rollout.restart is not None:
+        arrays |= {_RESTART + name: array for name, array in rollout.restart.to_tensors().items()}
     write_atomically(
         folder / _ARRAYS,
         lambda stream: np.savez(stream, allow_pickle=False, **arrays),
         is_durable=False,
     )
-    write_json(folder / _PARAMETERS, take.parameters.to_dict(), is_durable=False)
+    write_json(folder / _PARAMETERS, rollout.parameters.to_dict(), is_durable=False)
 
 
-def load_take(folder: Path) -> ObjectRollout:
-    """Read what `store_take` kept."""
+def load_rollout(folder: Path) -> ObjectRollout:
+    """Read a rollout that `store_rollout` wrote."""
     with np.load(folder / _ARRAYS, allow_pickle=False) as stored:
         arrays = dict(stored)
     model, restart = (
@@ -107,20 +107,20 @@ def make(
     state = order.check()
     content, run = _open(order, state)
     state = complete_state(state, content)
-    take = _take(order, state, content, report)
+    rollout = _rollout_of(order, state, content, report)
     # What draws takes as long to load as most files that are not drawn.
     if order.format in {"viser", "html"}:
         from app.exports.recording import record_scene
 
         as_html = order.format == "html"
-        write_bytes(out, record_scene(content, take, state, report, as_html=as_html))
+        write_bytes(out, record_scene(content, rollout, state, report, as_html=as_html))
         return
     if order.is_from_recorded_view:
         from app.exports.recorded_film import film_recorded_view
 
         film_recorded_view(
             content,
-            take,
+            rollout,
             state,
             report,
             out,
@@ -135,7 +135,7 @@ def make(
 
         film_scene(
             content,
-            take,
+            rollout,
             state,
             report,
             out,
@@ -146,13 +146,13 @@ def make(
         )
         return
     if order.format == "splat-ply":
-        write_bytes(out, _splats(order, run, take))
+        write_bytes(out, _splats(order, run, rollout))
         return
     snapshot = Snapshot(
         content=content,
         frame=state.frame,
-        rollout=take,
-        rollout_frame=state.frame if take is None else min(state.frame, take.ready - 1),
+        rollout=rollout,
+        rollout_frame=state.frame if rollout is None else min(state.frame, rollout.ready - 1),
         run=run,
         layers=state.layers,
         link=order.link,
@@ -181,16 +181,16 @@ def carried_splats(
         raise RunError(f"The splats of the run cannot be used: {error}") from error
 
 
-def _splats(order: FileRequest, run: Run | None, take: ObjectRollout | None) -> bytes:
+def _splats(order: FileRequest, run: Run | None, rollout: ObjectRollout | None) -> bytes:
     """Write splats where they were fitted, or in one frame of a rollout."""
     if run is None:
         raise UsageError("format: only a run has splats, a recording has none.")
     splats = read_splats(run)
-    if order.frame is None or take is None:
+    if order.frame is None or rollout is None:
         return splats_to_ply(splats)
-    if order.frame >= take.ready:
-        raise UsageError(f"f: there are frames 0 to {take.ready - 1}, not {order.frame}.")
-    return splats_to_ply(splats, carried_splats(splats, np.asarray(take.position[order.frame])))
+    if order.frame >= rollout.ready:
+        raise UsageError(f"f: there are frames 0 to {rollout.ready - 1}, not {order.frame}.")
+    return splats_to_ply(splats, carried_splats(splats, np.asarray(rollout.position[order.frame])))
 
 
 class _Places:
@@ -214,13 +214,13 @@ def _open(order: FileRequest, state: SessionState) -> tuple[Content, Run | None]
     return content, places.run(order.folder)
 
 
-def _take(
+def _rollout_of(
     order: FileRequest, state: SessionState, content: Content, report: Report
 ) -> ObjectRollout | None:
     """Find the rollout: one that was stored, the fitted one, or one that is simulated now."""
     fitted, parameters = content.fitted, state.parameters
-    if order.take:
-        return load_take(Path(order.take))
+    if order.rollout:
+        return load_rollout(Path(order.rollout))
     if fitted is None or parameters is None:
         return None
     if parameters == fitted.parameters and not state.automatic_substeps:

@@ -19,7 +19,7 @@ from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 
 FILMED_PIXELS_PER_SECOND = 2_500_000
-"""What a busy core draws; an idle one draws 4 million (the bundled run, 1280 x 720 pixels)."""
+"""Pixels a second that a busy core draws; an idle one draws 4 million (bundled run, 1280 x 720)."""
 _GIF_STEP_MS = 10
 """Pictures of a GIF are shown for a multiple of this time [ms]."""
 _GIF_COLORS = 256
@@ -29,7 +29,7 @@ _GIF_SHORTEST_MS = 20
 
 def film_scene(
     content: Content,
-    take: ObjectRollout | None,
+    rollout: ObjectRollout | None,
     state: SessionState,
     report: Callable[[int, int], None],
     out: Path,
@@ -46,7 +46,7 @@ def film_scene(
 
     Args:
         content: What can be shown.
-        take: The object's rollout; None without an object.
+        rollout: The object's rollout; None without an object.
         state: Layers, camera, theme, speed and part, as `complete_state` returns them.
         report: Told how many frames are filmed, and of how many.
         out: File to write.
@@ -62,7 +62,7 @@ def film_scene(
         motion.check(content.frame_count, content.sequence_name)
     frames = played_frames(content, state)
     check_time(content, frames, size, time_limit_s)
-    pictures = _pictures(content, take, state, report, frames=frames, size=size, motion=motion)
+    pictures = _pictures(content, rollout, state, report, frames=frames, size=size, motion=motion)
     film_of(pictures, out, rate=content.frame_rate * state.speed, size=size, as_gif=as_gif)
 
 
@@ -123,7 +123,7 @@ def film_of(
 
 def _pictures(
     content: Content,
-    take: ObjectRollout | None,
+    rollout: ObjectRollout | None,
     state: SessionState,
     report: Callable[[int, int], None],
     *,
@@ -133,7 +133,7 @@ def _pictures(
 ) -> Iterator[UInt8[ndarray, "row column 3"]]:
     """Draw frame after frame (red, green, blue)."""
     count = len(frames)
-    with Offscreen(content, take, state) as scene:
+    with Offscreen(content, rollout, state) as scene:
         for done, frame in enumerate(frames):
             scene.recorded = frame / content.frame_rate
             scene.draw(frame, is_playing=False)

@@ -30,7 +30,7 @@ class Offscreen:
     def __init__(
         self,
         content: Content,
-        take: ObjectRollout | None,
+        rollout: ObjectRollout | None,
         state: SessionState,
         *,
         frame_bytes: int = FRAME_BYTES,
@@ -40,7 +40,7 @@ class Offscreen:
 
         Args:
             content: What can be shown.
-            take: The object's rollout; None without an object.
+            rollout: The object's rollout; None without an object.
             state: Layers and camera, as `complete_state` returns them.
             frame_bytes: What a frame may weigh while the clock is running.
             is_rounded: Whether positions may be rounded to `GRID`, so that they pack better.
@@ -50,8 +50,8 @@ class Offscreen:
         self.content = content
         if is_rounded and (state.layers is None or state.layers.color == "plain"):
             step = GRID * 2.0 ** float(np.floor(np.log2(framing.extent)))
-            self.content, take = _rounded(content, take, step)
-        self._take = take
+            self.content, rollout = _rounded(content, rollout, step)
+        self._rollout = rollout
         self.server: viser.ViserServer = start_viser(without_markup(content.title))
         try:
             self._scene = SceneDrawing(
@@ -95,7 +95,7 @@ class Offscreen:
 
     @property
     def pose(self) -> Pose:
-        """Where the camera stands."""
+        """Pose of the camera."""
         return Pose.first(self.server.initial_camera)
 
     def draw(self, frame: int, *, is_playing: bool) -> None:
@@ -105,9 +105,9 @@ class Offscreen:
             frame: The frame.
             is_playing: Whether less may be drawn, as while the clock of a session is running.
         """
-        take = self._take
-        at = 0 if take is None else min(frame, take.ready - 1)
-        self._scene.draw(frame, take, at, is_playing=is_playing)
+        rollout = self._rollout
+        at = 0 if rollout is None else min(frame, rollout.ready - 1)
+        self._scene.draw(frame, rollout, at, is_playing=is_playing)
 
     def picture(
         self, size: tuple[int, int], pose: Pose | None = None
@@ -127,7 +127,7 @@ class Offscreen:
 
 
 @dataclass(eq=False, kw_only=True)
-class _RoundedTake(ObjectRollout):
+class _RoundedRollout(ObjectRollout):
     """Shows rounded positions, but its forces are those of the exact ones."""
 
     exact: ObjectRollout
@@ -154,7 +154,7 @@ def _on_grid(point: ndarray, step: float) -> ndarray:
 
 
 def _rounded(
-    content: Content, take: ObjectRollout | None, step: float
+    content: Content, rollout: ObjectRollout | None, step: float
 ) -> tuple[Content, ObjectRollout | None]:
     """Round all that moves to a grid, on which half of a float's digits are zero."""
     hands = tuple(replace(hand, vertex=_on_grid(hand.vertex, step)) for hand in content.hands)
@@ -164,8 +164,13 @@ def _rounded(
         own = {field.name: getattr(surface, field.name) for field in fields(surface)}
         surface = _RoundedSurface(**own, step=step)
     content = replace(content, hands=hands, control=control, surface=surface)
-    if take is None:
+    if rollout is None:
         return content, None
-    known = {field.name: getattr(take, field.name) for field in fields(take) if field.init}
-    known |= {"position": _on_grid(take.position, step), "control": _on_grid(take.control, step)}
-    return content, _RoundedTake(**known, exact=take)
+    arguments = {
+        field.name: getattr(rollout, field.name) for field in fields(rollout) if field.init
+    }
+    arguments |= {
+        "position": _on_grid(rollout.position, step),
+        "control": _on_grid(rollout.control, step),
+    }
+    return content, _RoundedRollout(**arguments, exact=rollout)

@@ -106,11 +106,11 @@ def state_from_query(query: Mapping[str, str]) -> SessionState:
     Raises:
         UsageError: If a field is unknown or its value makes no sense; names the field.
     """
-    known = {*_KEYS, *_CHOICES, *_PARAMETERS}
+    allowed = {*_KEYS, *_CHOICES, *_PARAMETERS}
     for name, text in query.items():
-        if name not in known:
+        if name not in allowed:
             raise UsageError(
-                f"{name[:40]!r}: a link has no such field. It has: {', '.join(sorted(known))}."
+                f"{name[:40]!r}: a link has no such field. It has: {', '.join(sorted(allowed))}."
             )
         if len(text) > {"show": 2 * _LONGEST, "path": _LONGEST_PATH}.get(name, _LONGEST):
             raise UsageError(f"{name}: the value is too long.")

@@ -38,7 +38,7 @@ _TITLE = 1 / 18
 
 def film_recorded_view(
     content: Content,
-    take: ObjectRollout | None,
+    rollout: ObjectRollout | None,
     state: SessionState,
     report: Callable[[int, int], None],
     out: Path,
@@ -55,7 +55,7 @@ def film_recorded_view(
 
     Args:
         content: What can be shown.
-        take: The object's rollout; None without an object.
+        rollout: The object's rollout; None without an object.
         state: Layers, theme, speed and part, as `complete_state` returns them.
         report: Told how many frames are filmed, and of how many.
         out: File to write.
@@ -75,7 +75,7 @@ def film_recorded_view(
     size = panels * camera.width + (panels - 1) * _GAP, camera.height
     check_time(content, frames, size, time_limit_s)
     is_dark = state.theme == "dark"
-    artist = _Artist(content, take, camera, layers, is_dark=is_dark)
+    artist = _Artist(content, rollout, camera, layers, is_dark=is_dark)
     pictures = _pictures(recorded, artist, frames, beside, report)
     film_of(pictures, out, rate=content.frame_rate * state.speed, size=size, as_gif=as_gif)
 
@@ -113,23 +113,23 @@ class _Artist:
     def __init__(
         self,
         content: Content,
-        take: ObjectRollout | None,
+        rollout: ObjectRollout | None,
         camera: PinholeCamera,
         layers: Layers,
         *,
         is_dark: bool,
     ) -> None:
         self.is_dark = is_dark
-        self._content, self._take = content, take
+        self._content, self._rollout = content, rollout
         self._camera, self._layers = camera, layers
         ground = np.array(BACKGROUND[is_dark], np.float32) / np.float32(255.0)
         self._ground = np.broadcast_to(ground, (camera.height, camera.width, 3))
-        count = 0 if take is None else take.model.node_count
+        count = 0 if rollout is None else rollout.model.node_count
         splats, surface = content.splats, content.surface
         has_splats = splats is not None and len(splats.rest_node) == count
         self._appearance = Appearance.of(splats) if splats is not None and has_splats else None
         self._surface = surface if surface is not None and surface.node_count == count else None
-        if take is not None and self._appearance is None and self._surface is None:
+        if rollout is not None and self._appearance is None and self._surface is None:
             raise UsageError(
                 f"view: the object in '{content.sequence_name}' has neither splats nor a surface "
                 "that a film from a recorded camera could show. Film the scene instead."
@@ -141,8 +141,10 @@ class _Artist:
         """Draw a frame; also tells which pixels object and hands cover."""
         shapes = list(self._hands(frame)) if self._layers.hands else []
         node = None
-        if self._take is not None:
-            node = np.asarray(self._take.position[min(frame, self._take.ready - 1)], np.float32)
+        if self._rollout is not None:
+            node = np.asarray(
+                self._rollout.position[min(frame, self._rollout.ready - 1)], np.float32
+            )
         if node is not None and self._appearance is not None:
             picture = self._appearance.render_frame(
                 self._camera, node, shapes, background=self._ground, light=SKY

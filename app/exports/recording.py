@@ -13,14 +13,14 @@ from physhandi.object_rollout import ObjectRollout
 LONGEST_RECORDING = 3_000
 """Longer sequences are not recorded."""
 BYTES_FOR_300_FRAMES = 20_000_000
-"""What a recording of 300 frames may weigh, springs and arrows giving way."""
+"""Largest size of a recording of 300 frames [bytes]; springs and arrows are left out to keep it."""
 _PACKING = 0.97
-"""What is left for frames of a file, beside what describes the scene."""
+"""Share of it for frames, beside the description of the scene."""
 
 
 def record_scene(
     content: Content,
-    take: ObjectRollout | None,
+    rollout: ObjectRollout | None,
     state: SessionState,
     report: Callable[[int, int], None],
     *,
@@ -30,7 +30,7 @@ def record_scene(
 
     Args:
         content: What can be shown.
-        take: The object's rollout; None without an object.
+        rollout: The object's rollout; None without an object.
         state: Layers, camera, theme and speed, as `complete_state` returns them.
         report: Told how many frames are recorded, and of how many.
         as_html: Whether to make a page that plays by itself, instead of a ``.viser`` file.
@@ -49,7 +49,7 @@ def record_scene(
         )
     frame_bytes = int(_PACKING * BYTES_FOR_300_FRAMES / 300)
     pause = 1.0 / (content.frame_rate * state.speed)
-    with Offscreen(content, take, state, frame_bytes=frame_bytes, is_rounded=True) as scene:
+    with Offscreen(content, rollout, state, frame_bytes=frame_bytes, is_rounded=True) as scene:
         scene.draw(0, is_playing=True)
         serializer = scene.server.get_scene_serializer()
         for frame in range(count):

@@ -1,4 +1,4 @@
-"""What a file is to show: an order for the process that makes it."""
+"""Request for a file to export, as the process that makes it gets it."""
 
 import json
 from collections.abc import Mapping
@@ -29,10 +29,10 @@ Format = Literal[
     "splat-ply",
 ]
 Beside = Literal["none", "recording", "difference"]
-"""What is beside a film from a recorded camera: nothing, the recording, or that and how much both
+"""Pictures beside a film from a recorded camera: none, the recording, or that and how much both
 differ."""
 _SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip", "newton": "zip", "splat-ply": "ply"}
-"""How the files of formats end, if not like the format."""
+"""File suffixes of formats, where they differ from the format's name."""
 SMALLEST, LARGEST = 16, 4_096
 """Shortest and longest side of a picture [px]."""
 LARGEST_TURN = 3_600.0
@@ -44,19 +44,19 @@ class FileRequest:
     """A file that is to be made."""
 
     kind: Literal["run", "sequence"]
-    """What is shown."""
+    """Kind of the exported item."""
     folder: str
-    """Where the run or the sequence lies."""
+    """Folder of the run or the sequence."""
     format: Format
-    """Which kind of file."""
+    """File format."""
     query: Mapping[str, str] = field(default_factory=dict[str, str])
-    """What a link would say of it; see `app.exports.permalink`."""
+    """Query of the scene's permalink; see `app.exports.permalink`."""
     frame: int | None = None
     """Only this frame, as one file (PLY); None for all, or for splats where they were fitted."""
     recordings: Mapping[str, str] = field(default_factory=dict[str, str])
     """Folders of recordings by name, for runs whose recording has moved."""
-    take: str = ""
-    """Folder with a rollout that was simulated elsewhere; see `store_take`."""
+    rollout: str = ""
+    """Folder with a rollout that was simulated elsewhere; see `store_rollout`."""
     width: int = 1280
     """Width of a picture or film [px]."""
     height: int = 720
@@ -64,7 +64,7 @@ class FileRequest:
     turn: float = 0.0
     """Angle by which the camera of a film goes round [degrees]."""
     camera_path: str = ""
-    """How the camera of a film moves, as JSON; see `parse_camera_path`."""
+    """Camera path of a film, as JSON; see `parse_camera_path`."""
     view: str = ""
     """Camera of the recording from which a film is taken; empty for the one that the link looks
     from, else the first."""
@@ -77,7 +77,7 @@ class FileRequest:
 
     @property
     def suffix(self) -> str:
-        """How the file ends, without the dot."""
+        """File suffix, without the dot."""
         is_one = self.format == "ply" and self.frame is not None
         return "ply" if is_one else _SUFFIXES.get(self.format, self.format)
 
@@ -88,7 +88,7 @@ class FileRequest:
 
     @property
     def motion(self) -> CameraMotion | None:
-        """How the camera of a film moves, at last as the link says; None for one that stands still.
+        """Camera motion of a film, by default that of the link; None for a camera at rest.
 
         Raises:
             UsageError: If the camera path makes no sense, or there is a turn, too.

@@ -34,7 +34,7 @@ _NEAR = 1e-3
 _LEAST_RADIUS, _LEAST_WIDTH = 0.5, 0.5
 _GRID_PIECES = 24
 _SUNK = 1.005
-"""How much farther away grids are than what lies in them."""
+"""Factor by which grids are drawn farther away than what lies in them."""
 _CORNERS = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], np.float64)
 
 _Nodes = dict[str, Any]

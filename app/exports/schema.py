@@ -27,30 +27,30 @@ MEDIA_TYPES: dict[str, str] = {
 
 
 class FieldError(BaseModel):
-    """What is wrong with one field."""
+    """Problem of one field."""
 
     field: str
     """Its place in the request."""
     message: str
-    """What is wrong."""
+    """Description of the problem."""
 
 
 class ErrorDetail(BaseModel):
-    """What went wrong, for programs and for people."""
+    """An error, for programs and for people."""
 
     code: str
     """Short name of the kind of error."""
     message: str
-    """What happened and what to do."""
+    """Description of the error, and advice."""
     fields: list[FieldError] = Field(default_factory=list[FieldError])
-    """What is wrong with which field."""
+    """Problems of single fields."""
 
 
 class ErrorAnswer(BaseModel):
     """Every error has this shape."""
 
     error: ErrorDetail
-    """What went wrong."""
+    """The error."""
 
 
 def errors(*codes: int) -> dict[int | str, dict[str, Any]]:

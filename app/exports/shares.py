@@ -48,7 +48,7 @@ _POLICY = (
 
 
 class StoredShare(BaseModel):
-    """What is kept of a share beside its page."""
+    """Description of a share, stored beside its page."""
 
     run: str
     """Id of the run that it shows."""
@@ -57,7 +57,7 @@ class StoredShare(BaseModel):
     query: str = ""
     """The view, as the part of a link after the question mark."""
     created: str
-    """When it was made, in UTC."""
+    """Time of creation, in UTC."""
 
 
 class Share(StoredShare):
@@ -115,24 +115,24 @@ class Shares:
 
     def all(self) -> list[Share]:
         """List the shares, the newest first; damaged ones are named in the log alone."""
-        found, problems = self._read_all()
+        shares, problems = self._read_all()
         for problem in problems:
             logger.warning("%s", problem)
-        return sorted(found, key=lambda share: share.created, reverse=True)
+        return sorted(shares, key=lambda share: share.created, reverse=True)
 
     def problems(self) -> list[str]:
         """Say of each damaged share what is wrong."""
         return self._read_all()[1]
 
     def _read_all(self) -> tuple[list[Share], list[str]]:
-        found: list[Share] = []
+        shares: list[Share] = []
         problems: list[str] = []
         for folder in sorted(self._folder.glob("[!.]*")):
             try:
-                found.append(self._read(folder))
+                shares.append(self._read(folder))
             except RunError as error:
                 problems.append(str(error))
-        return found, problems
+        return shares, problems
 
     def page(self, name: str) -> tuple[Path, str] | None:
         """Find the page of a share, and the run that it shows.
@@ -222,8 +222,8 @@ def create_shares(catalog: Catalog, file_cache: FileCache, shares: Shares) -> AP
 
     @router.get(SHARED + "{share_id:path}", include_in_schema=False)
     def show(share_id: str) -> Response:
-        found = shares.page(share_id) if _NAME.fullmatch(share_id) else None
-        if found is None or not _is_there(found[1]):
+        shared = shares.page(share_id) if _NAME.fullmatch(share_id) else None
+        if shared is None or not _is_there(shared[1]):
             return bare_page(
                 404,
                 "Nothing is shared here",
@@ -231,7 +231,7 @@ def create_shares(catalog: Catalog, file_cache: FileCache, shares: Shares) -> AP
                 "mistyped. Ask who sent it to you.</p>",
             )
         headers = {"Content-Security-Policy": _POLICY, "X-Robots-Tag": "noindex"}
-        return FileResponse(found[0], media_type="text/html", headers=headers)
+        return FileResponse(shared[0], media_type="text/html", headers=headers)
 
     def _is_there(run_id: str) -> bool:
         """Whether a run was not deleted, with which its shares go."""

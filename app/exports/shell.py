@@ -43,7 +43,7 @@ class ExportOptions:
     view: str = ""
     """Camera of the recording from which a film is taken."""
     beside: Beside | None = None
-    """What is beside such a film."""
+    """Picture beside such a film."""
     device: str = "cpu"
     """Warp device, if the link changes parameters."""
     overwrite: bool = False

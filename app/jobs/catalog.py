@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 _FORMAT = "physhandi-run-index/1"
 _WORTH_SAVING = 50
 DEFECT = "a mistake of the program, whose log tells more"
-"""What is to blame where no error of ours was expected."""
+"""Cause that is named where no error of ours was expected."""
 
 Stamp = tuple[int, ...]
 
@@ -293,17 +293,17 @@ class Catalog:
         Raises:
             SequenceError: If one is gone or damaged.
         """
-        found: list[Sequence] = []
+        opened: list[Sequence] = []
         for folder, name in zip(run.sequences, run.sequence_names, strict=True):
             try:
-                found.append(
+                opened.append(
                     Sequence.load(folder) if Path(folder).is_dir() else self.sequence(name)
                 )
             except PhysHandiError as error:
                 raise SequenceError(
                     f"Run '{run.id}' needs sequence '{name}', which cannot be opened: {error}"
                 ) from error
-        return found
+        return opened
 
 
 class _Folders(Generic[T]):
@@ -313,13 +313,13 @@ class _Folders(Generic[T]):
         self._load = load
         self._watched = watched
         self._lock = threading.Lock()
-        self._known: dict[str, tuple[object, Path, tuple[T | None, str | None]]] = {}
+        self._entries: dict[str, tuple[object, Path, tuple[T | None, str | None]]] = {}
 
     @property
     def paths(self) -> set[str]:
         """Folders that were opened."""
         with self._lock:
-            return set(self._known)
+            return set(self._entries)
 
     def list(self, root: Path) -> list[tuple[Path, tuple[T | None, str | None]]]:
         """Open all folders directly below a root; what cannot be opened says why."""
@@ -327,10 +327,10 @@ class _Folders(Generic[T]):
         listed = [entry for name in _names_in(root) if (entry := self._look(f"{root}/{name}"))]
         with self._lock:
             prefix = f"{root}/"
-            if sum(path.startswith(prefix) for path in self._known) > len(listed):
+            if sum(path.startswith(prefix) for path in self._entries) > len(listed):
                 present = {str(folder) for folder, _ in listed}
-                for path in [p for p in self._known if p.startswith(prefix) and p not in present]:
-                    del self._known[path]
+                for path in [p for p in self._entries if p.startswith(prefix) and p not in present]:
+                    del self._entries[path]
         return listed
 
     def find(self, root: Path, name: str) -> tuple[T | None, str | None] | None:
@@ -344,12 +344,12 @@ class _Folders(Generic[T]):
         stamp = self._stamp(path)
         if stamp is None:
             return None
-        entry = self._known.get(path)
+        entry = self._entries.get(path)
         if entry is None or entry[0] != stamp:
             folder = Path(path)
             entry = (stamp, folder, self._open(folder, stamp))
             with self._lock:
-                self._known[path] = entry
+                self._entries[path] = entry
         return entry[1], entry[2]
 
     def _stamp(self, path: str) -> Stamp | None:

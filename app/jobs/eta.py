@@ -142,7 +142,7 @@ class FinishedFit:
     seconds: Mapping[str, float]
     """Time that its stages took [s]."""
     end: float
-    """When its results were published [s since the epoch]."""
+    """Time of publication of its results [s since the epoch]."""
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ class KeyedRequest:
     """A wish for a run that may come several times."""
 
     key: str
-    """What the client calls it, hashed: it may be of any length."""
+    """The client's key, hashed: it may be of any length."""
     body: str
-    """What is wished for, hashed."""
+    """The request's body, hashed."""
 
     @classmethod
     def of(cls, key: str, body: Mapping[str, Any]) -> "KeyedRequest":
@@ -54,7 +54,7 @@ class LaunchKeys:
             UsageError: If another request had its key.
             RunError: If its run was deleted since.
         """
-        if (entry := self._known().get(request.key)) is None:
+        if (entry := self._entries().get(request.key)) is None:
             return None
         body, run_id, is_deleted = entry
         if body != request.body:
@@ -71,21 +71,21 @@ class LaunchKeys:
 
     def note(self, request: KeyedRequest, run_id: str) -> None:
         """Remember a run that is about to be made."""
-        known = self._known()
-        kept = dict(list(known.items())[-(MOST_LAUNCH_KEYS - 1) :])
-        self._save(kept | {request.key: (request.body, run_id, False)})
+        entries = self._entries()
+        recent = dict(list(entries.items())[-(MOST_LAUNCH_KEYS - 1) :])
+        self._save(recent | {request.key: (request.body, run_id, False)})
 
     def note_deleted(self, run_id: str) -> None:
         """Remember that a run was deleted, so that who asks late does not get another one."""
-        known = self._known()
-        if any(entry[1] == run_id for entry in known.values()):
-            self._save({k: (b, r, gone or r == run_id) for k, (b, r, gone) in known.items()})
+        entries = self._entries()
+        if any(entry[1] == run_id for entry in entries.values()):
+            self._save({k: (b, r, gone or r == run_id) for k, (b, r, gone) in entries.items()})
 
     def _save(self, entries: dict[str, tuple[str, str, bool]]) -> None:
         write_json(self._path, {"format": _FORMAT, "launches": entries})
         self._read = entries
 
-    def _known(self) -> dict[str, tuple[str, str, bool]]:
+    def _entries(self) -> dict[str, tuple[str, str, bool]]:
         if self._read is None:
             self._read = self._load()
         return self._read
@@ -96,11 +96,11 @@ class LaunchKeys:
         except RunError as error:
             logger.warning("its keys are forgotten: %s", error)
             return {}
-        found: dict[str, tuple[str, str, bool]] = {}
+        entries: dict[str, tuple[str, str, bool]] = {}
         for key, entry in (named_fields(content.get("launches")) or {}).items():
             match cast("object", entry):
                 case [str(body), str(run_id), bool(is_deleted)]:
-                    found[key] = (body, run_id, is_deleted)
+                    entries[key] = (body, run_id, is_deleted)
                 case _:
                     logger.warning("%s is damaged at key %s, which is forgotten", self._path, key)
-        return found
+        return entries

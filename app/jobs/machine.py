@@ -148,7 +148,7 @@ class Machine:
         self._lock = threading.Lock()
         self._time = -_KEPT_S
         self._load: dict[str, Any] = {}
-        self._known: dict[int, psutil.Process] = {}
+        self._processes: dict[int, psutil.Process] = {}
         self._processor = processor_name()
         psutil.cpu_percent()  # The first call only starts the clock.
 
@@ -189,9 +189,9 @@ class Machine:
                 except psutil.Error:
                     continue
             alive = {process.pid for process in family}
-            gone = [pid for pid in self._known if not psutil.pid_exists(pid)]
+            gone = [pid for pid in self._processes if not psutil.pid_exists(pid)]
             for pid in gone:
-                del self._known[pid]
+                del self._processes[pid]
         taken = self._cards.memory_of(alive)
         return {
             "memory": memory,
@@ -207,7 +207,7 @@ class Machine:
             members = [root, *root.children(recursive=True)]
         except psutil.Error:
             return []
-        return [self._known.setdefault(process.pid, process) for process in members]
+        return [self._processes.setdefault(process.pid, process) for process in members]
 
     def _measure(self) -> dict[str, Any]:
         memory = psutil.virtual_memory()

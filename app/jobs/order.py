@@ -1,4 +1,4 @@
-"""What a fit is asked to do: a profile, what differs from it, and the run it is made from."""
+"""Orders of fits: a profile, what differs from it, and the run it is made from."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -212,9 +212,11 @@ def require_agreement(sequences: Sequence[Recording], *, accepts_missing: bool) 
     """
     if not readiness(sequences)[EVALUATION].is_ready:
         raise MissingInputError(nothing_to_fit(sequences))
-    told = skipped_object(sequences)
-    if told is not None and not accepts_missing:
-        raise SkippedObjectError(f"{told} To fit the hands alone, accept that (accepts_missing).")
+    skipped = skipped_object(sequences)
+    if skipped is not None and not accepts_missing:
+        raise SkippedObjectError(
+            f"{skipped} To fit the hands alone, accept that (accepts_missing)."
+        )
 
 
 def describe_readiness(
@@ -228,10 +230,10 @@ def describe_readiness(
     """
     if not sequences:
         return {"stages": {}, "nothing_to_fit": None, "skips_object": None}
-    found = readiness(sequences, config)
+    stages = readiness(sequences, config)
     return {
-        "stages": {name: stage.to_dict() for name, stage in found.items()},
-        "nothing_to_fit": None if found[EVALUATION].is_ready else nothing_to_fit(sequences),
+        "stages": {name: stage.to_dict() for name, stage in stages.items()},
+        "nothing_to_fit": None if stages[EVALUATION].is_ready else nothing_to_fit(sequences),
         "skips_object": skipped_object(sequences),
     }
 
@@ -256,14 +258,14 @@ def check_order(
     """
     base = named_profile(profile)
     sequences = [catalog.sequence(sequence_id) for sequence_id in sequence_ids]
-    found: dict[str, Any] = {"problems": [], "overrides": {}, "expected": None}
+    report: dict[str, Any] = {"problems": [], "overrides": {}, "expected": None}
     try:
         config = apply_overrides(base, overrides)
     except SettingsError as error:
-        found["problems"] = [
+        report["problems"] = [
             {"field": path, "message": problem} for path, problem in error.fields.items()
         ]
-        return found | describe_readiness(sequences)
-    found["overrides"] = overrides_of(config, base)
-    found["expected"] = forecast.of_order(config.to_dict(), sequences)
-    return found | describe_readiness(sequences, config)
+        return report | describe_readiness(sequences)
+    report["overrides"] = overrides_of(config, base)
+    report["expected"] = forecast.of_order(config.to_dict(), sequences)
+    return report | describe_readiness(sequences, config)

@@ -109,19 +109,19 @@ class JobView:
     is_published: bool = False
     """Whether there are results to look at."""
     priority: Priority | None = None
-    """How urgent it is, of a run that waits."""
+    """Priority of a run that waits."""
 
 
 @dataclass(frozen=True)
 class LostRun:
-    """What was done with a run that had lost its process."""
+    """A run that had lost its process, and what was done with it."""
 
     time: str
-    """When, ISO 8601."""
+    """Time, ISO 8601."""
     run: str
     """Id of the run."""
     why: str
-    """What happened, and what became of it."""
+    """The loss, and its consequence for the run."""
 
 
 class Scheduler:
@@ -165,7 +165,7 @@ class Scheduler:
         """Tickets of the runs that wait, the next one first; replaced, never changed."""
         self._next_survey = 0.0
         self._busy: tuple[str, ...] = ()
-        self._known: dict[str, Run] = {}
+        self._moving: dict[str, Run] = {}
         self._claim: int | None = None
         self._closed = threading.Event()
         self._wake = threading.Event()
@@ -454,7 +454,7 @@ class Scheduler:
 
     @property
     def place(self) -> str:
-        """Where fits run, for people: devices of this machine, or a cluster."""
+        """Name of the place where fits run: devices of this machine, or a cluster."""
         return self._engine.name or ", ".join(self._settings.devices)
 
     @property
@@ -464,11 +464,11 @@ class Scheduler:
 
     def at_work(self) -> list[Run]:
         """List the runs that have a place, as the queue saw them last."""
-        return [self._known[run_id] for run_id in self._busy if run_id in self._known]
+        return [self._moving[run_id] for run_id in self._busy if run_id in self._moving]
 
     def in_line(self) -> list[Run]:
         """List the runs that wait, the next one first."""
-        return [self._known[run_id] for run_id in self._line if run_id in self._known]
+        return [self._moving[run_id] for run_id in self._line if run_id in self._moving]
 
     def view(self, item: RunItem) -> JobView:
         """Tell how far a run is and why it waits."""
@@ -497,21 +497,21 @@ class Scheduler:
         is_running = live_holder(run.folder) is not None
         if run.id in self._stopping:
             # Until nothing is left: what is started meanwhile would be ended with the rest.
-            told, _ = _told_by(run)
+            progress, _ = _progress_of(run)
             trouble = self._trouble_of(run.folder)
             return JobView(
-                "stopping", reason=_sentences("Ending its processes.", trouble), progress=told
+                "stopping", reason=_sentences("Ending its processes.", trouble), progress=progress
             )
         if is_running:
-            told, problem = _told_by(run)
+            progress, problem = _progress_of(run)
             reason = _sentences(_remark(run.folder) or problem, self._trouble_of(run.folder))
-            return JobView("running", reason=reason, progress=told)
+            return JobView("running", reason=reason, progress=progress)
         if (run.folder / QUEUED).is_file():
             return self._look_in_line(run)
         if not (run.folder / EXIT).is_file() and self._is_supervised(run.folder):
             engine = self._engine_of(run.folder)
-            told = _elsewhere(run.folder) if engine is None else engine.told(run.folder)
-            return JobView("starting", reason=_sentences(_remark(run.folder), told))
+            waits = _elsewhere(run.folder) if engine is None else engine.waits_for(run.folder)
+            return JobView("starting", reason=_sentences(_remark(run.folder), waits))
         return self._look_back(run)
 
     def _engine_of(self, folder: Path) -> Engine | None:
@@ -533,16 +533,16 @@ class Scheduler:
     def _look_back(self, run: Run) -> JobView:
         """Tell how a run ended that is neither in line nor at work."""
         if is_lost(run.folder):
-            told = self._hindered.get(run.id, "What is left of it is being ended.")
-            return JobView("stopping", reason=f"{self._loss(run.folder)} {told}")
+            hindrance = self._hindered.get(run.id, "What is left of it is being ended.")
+            return JobView("stopping", reason=f"{self._loss(run.folder)} {hindrance}")
         state = run.state
         if state == "queued":
             return JobView("failed", reason="It was never started. Resume starts it.")
         if state == "succeeded" and not run.is_published:
             return JobView("damaged", reason=not_whole(run.id))
-        told, problem = _told_by(run)
+        progress, problem = _progress_of(run)
         reason = run.error or problem
-        return JobView(state, reason=reason, progress=told, is_published=run.is_published)
+        return JobView(state, reason=reason, progress=progress, is_published=run.is_published)
 
     def _look_in_line(self, run: Run) -> JobView:
         line = self._line
@@ -642,7 +642,7 @@ class Scheduler:
         runs = {i.id: i.run for i in items.values() if i.run and i.id in moving}
         newest = sorted(runs.values(), key=lambda run: run.created, reverse=True)
         self._busy = tuple(run.id for run in newest if run.id in busy)
-        self._known = runs
+        self._moving = runs
         self._line = _in_order(tickets)
         return items
 
@@ -683,7 +683,7 @@ class Scheduler:
         What has ended moves again only if somebody resumes it, and then it was put in line here.
         What another program puts into the folder is found when all runs are looked at.
         """
-        for run_id in dict.fromkeys((*self._known, *self._busy, *self._line)):
+        for run_id in dict.fromkeys((*self._moving, *self._busy, *self._line)):
             with suppress(UnknownRunError):  # It was deleted since.
                 yield self._catalog.run_item(run_id)
 
@@ -814,7 +814,7 @@ def _is_at(path: str, folder: Path) -> bool:
     return Path(path).name == folder.name and Path(path).resolve() == folder
 
 
-def _told_by(run: Run) -> tuple[dict[str, Any], str]:
+def _progress_of(run: Run) -> tuple[dict[str, Any], str]:
     """Give a run's latest report; if it is damaged, which costs no more than the report, why."""
     try:
         return run.progress, ""
@@ -822,8 +822,8 @@ def _told_by(run: Run) -> tuple[dict[str, Any], str]:
         return {}, str(error)
 
 
-def _sentences(*told: str) -> str:
-    return " ".join(sentence for sentence in told if sentence)
+def _sentences(*sentences: str) -> str:
+    return " ".join(sentence for sentence in sentences if sentence)
 
 
 def _elsewhere(folder: Path) -> str:

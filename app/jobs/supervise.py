@@ -55,8 +55,8 @@ def supervise(run_folder: Path, device: str, worker: str, hung_after_s: float) -
     if watch.hung is not None:
         start_again_or_end(run_folder, watch.hung)
     elif kind == _KILLED and count_memory_kills() > killed_before:
-        told = "The system killed the worker because memory had run out."
-        note_end(run_folder, told, MemoryError.__name__)
+        reason = "The system killed the worker because memory had run out."
+        note_end(run_folder, reason, MemoryError.__name__)
     elif kind == _KILLED:
         start_again_or_end(run_folder, error)
     else:
@@ -86,9 +86,9 @@ def count_memory_kills(root: Path = Path("/")) -> int:
             tried.append((root / "sys/fs/cgroup/memory", "memory.oom_control"))
     for file in (*(folder / name for folder, name in tried), root / "proc/vmstat"):
         with suppress(OSError):
-            found = re.search(r"^oom_kill (\d+)$", file.read_text(), re.MULTILINE)
-            if found:
-                return int(found[1])
+            match = re.search(r"^oom_kill (\d+)$", file.read_text(), re.MULTILINE)
+            if match:
+                return int(match[1])
     return 0
 
 

@@ -27,7 +27,7 @@ QUEUED = "queued.json"
 STARTED = "started.json"
 """File of a run that the queue has started and that has not ended."""
 MOST_STARTS = 2
-"""How often a run is started that loses its process through no fault of its own."""
+"""Most starts of a run that loses its process through no fault of its own."""
 
 Priority = Literal["low", "normal", "high"]
 _EARLIER_S = {"low": -86_400.0, "normal": 0.0, "high": 86_400.0}
@@ -36,12 +36,12 @@ _EARLIER_S = {"low": -86_400.0, "normal": 0.0, "high": 86_400.0}
 
 @dataclass(frozen=True)
 class Ticket:
-    """What the queue knows of a run that waits or is at work."""
+    """Entry of the queue for a run that waits or is at work."""
 
     time: float = 0.0
-    """When it was put in line [s since 1970]."""
+    """Time at which it was put in line [s since 1970]."""
     starts: int = 0
-    """How often it was started."""
+    """Number of times that it was started."""
     why: str = ""
     """Why it was started again."""
     device: str = ""
@@ -49,13 +49,13 @@ class Ticket:
     engine: str = ""
     """Name of the engine that it was started with; see `Engine.name`."""
     priority: Priority = "normal"
-    """How urgent it is."""
+    """Its priority."""
     who: str = ""
-    """Who asked for it, as `Visitor.name`; empty if that is not known."""
+    """`Visitor.name` of who asked for it; empty if unknown."""
 
     @property
     def turn(self) -> float:
-        """What the line is sorted by [s since 1970]; it stays what it is while the run waits.
+        """Sort key of the queue [s since 1970]; it is constant while the run waits.
 
         One of high priority passes those of normal priority that came up to a day before it, and
         nothing that came earlier, so that whoever has waited for long enough is passed by nobody.
@@ -64,7 +64,7 @@ class Ticket:
 
     @property
     def remark(self) -> str:
-        """What is told of a run that was not started for the first time."""
+        """Sentence about earlier starts; empty for a run that is started for the first time."""
         if not self.why:
             return ""
         return f"{self.why} It was started again ({self.starts} of {MOST_STARTS})."
@@ -87,7 +87,7 @@ def read_ticket(path: Path) -> Ticket | None:
         why=_field_of(content, "why", Text, ""),
         device=_field_of(content, "device", Text, ""),
         engine=_field_of(content, "engine", Text, ""),
-        priority=next((known for known in get_args(Priority) if known == priority), "normal"),
+        priority=next((level for level in get_args(Priority) if level == priority), "normal"),
         who=_field_of(content, "who", Text, ""),
     )
 
@@ -198,12 +198,12 @@ def note_end(run_folder: Path, error: str, kind: str = "") -> None:
             return
         (run_folder / RESERVE).unlink(missing_ok=True)
         if not (run_folder / EXIT).is_file():
-            told: dict[str, str] = {"state": "failed", "error": error, "error_type": kind}
+            end: dict[str, str] = {"state": "failed", "error": error, "error_type": kind}
             if is_filled(run_folder):
-                told = {"state": "succeeded"}
+                end = {"state": "succeeded"}
             elif is_cancelled:
-                told = {"state": "cancelled", "error": "Cancelled.", "error_type": ""}
-            write_json(run_folder / EXIT, {**told, "time": now()})
+                end = {"state": "cancelled", "error": "Cancelled.", "error_type": ""}
+            write_json(run_folder / EXIT, {**end, "time": now()})
         (run_folder / STARTED).unlink(missing_ok=True)
 
 

@@ -37,7 +37,7 @@ _SHOWN: dict[str, tuple[str, Any]] = {
     "environment": (ENVIRONMENT, EnvironmentFile),
     "parameters": (PARAMETERS_FILE, dict[str, Any]),
 }
-"""What a run's page shows of its results, with file and shape."""
+"""Results that a run's page lists, with file and shape."""
 CURVE_LIMIT = 2000
 """Most points of a curve that are sent to a browser."""
 # Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
@@ -61,8 +61,8 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
         "name": sequence.name,
         "description": sequence.description,
         "label": sequence.label,
-        "origin": _told(sequence.provenance, "origin"),
-        "licence": _told(sequence.provenance, "licence", "license"),
+        "origin": _first_text(sequence.provenance, "origin"),
+        "licence": _first_text(sequence.provenance, "licence", "license"),
         "frame_count": sequence.frame_count,
         "frame_rate": sequence.frame_rate,
         "duration_s": sequence.frame_count / sequence.frame_rate,
@@ -76,10 +76,10 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
     }
 
 
-def _told(provenance: Mapping[str, Any], *names: str) -> str:
+def _first_text(provenance: Mapping[str, Any], *names: str) -> str:
     """Give the first of these fields that is text, which whoever made the sequence wrote."""
-    found = (provenance.get(name) for name in names)
-    return next((text for text in found if isinstance(text, str)), "")
+    values = (provenance.get(name) for name in names)
+    return next((text for text in values if isinstance(text, str)), "")
 
 
 def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
@@ -294,7 +294,7 @@ def _names(run: Run) -> Sequence[str]:
 
 
 def _running_since(run: Run, finished: Sequence[Mapping[str, Any]]) -> float | None:
-    """When the stage that is at work began: at the end of the one before, or of this attempt."""
+    """Start of the current stage: the end of the one before, or the start of this attempt."""
     environment = named_fields(run.json(ENVIRONMENT)) if run.has(ENVIRONMENT) else None
     times = [(environment or {}).get("started"), *(stage.get("time") for stage in finished[-1:])]
     return max((begin for time in times if (begin := moment_of(time)) is not None), default=None)
@@ -323,17 +323,17 @@ _DEFECT = (
 
 
 _NO_DEVICE_MEMORY = re.compile(r"Failed to allocate \d+ bytes on device|CUDA out of memory")
-"""What Warp and PyTorch say."""
+"""Messages of Warp and PyTorch about a lack of memory."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a run failed."""
+    """Cause of a run's failure."""
 
     message: str
-    """What happened."""
+    """Description of the cause."""
     advice: str
-    """What the user can do."""
+    """Advice to the user."""
 
 
 def explain(run: Run | None, reason: str, *, is_damaged: bool = False) -> Failure:
@@ -560,9 +560,9 @@ def thin(curve: list[list[float]], limit: int) -> list[list[float]]:
 
 def _points(curve: object) -> list[list[float]]:
     """Keep the points of a stored curve that have a finite loss."""
-    found: list[list[float]] = []
+    points: list[list[float]] = []
     for point in cast("list[Any]", curve) if isinstance(curve, list) else []:
         values = cast("list[Any]", point)[:2] if isinstance(point, list) else []
         if len(values) == 2 and all(isinstance(value, int | float) for value in values):
-            found.append(values)
-    return found
+            points.append(values)
+    return points

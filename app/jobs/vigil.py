@@ -62,14 +62,14 @@ class Vigil:
         limit = self._limit_s if is_idle else _BUSY_FACTOR * self._limit_s
         if self._silent_s >= limit:
             did = " and did nothing" if is_idle else ""
-            return f"Its process hung: it gave no sign of life for {_told(self._silent_s)}{did}."
+            return f"Its process hung: it gave no sign of life for {_text(self._silent_s)}{did}."
         is_idle = cpu_s - self._still_cpu_s < _IDLE_SHARE * self._still_s
         if is_idle and self._still_s >= _STALL_FACTOR * self._limit_s:
             return (
-                f"Its process hung: it got no further for {_told(self._still_s)} and did nothing."
+                f"Its process hung: it got no further for {_text(self._still_s)} and did nothing."
             )
         return None
 
 
-def _told(seconds: float) -> str:
+def _text(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 180.0 else f"{seconds / 60.0:.0f} min"

@@ -1,4 +1,4 @@
-"""What browsers follow: changes in the list of runs, and one run with its progress and its log."""
+"""Event streams for browsers: changes of the list of runs; progress and log of one run."""
 
 import os
 import re
@@ -75,7 +75,7 @@ class Watch:
         self._seen = int(position[1]) if position else -1
         self._log = int(position[2]) if position and position[2] else None
         self._offset = 0
-        self._known: dict[str, Any] | None = None
+        self._sent: dict[str, Any] | None = None
         self._is_gone = False
         self._load = load
         self._load_time = -_LOAD_INTERVAL_S
@@ -95,8 +95,8 @@ class Watch:
         yield from self._lines(is_ended=run["state"] in ENDED)
         if run["state"] in AT_WORK:
             yield from self._shown(has_begun=run["state"] != "starting")
-        if run != self._known:
-            self._known = run
+        if run != self._sent:
+            self._sent = run
             yield self._name, "run", run
 
     @property
@@ -108,7 +108,7 @@ class Watch:
             return self._look()
         except (PhysHandiError, OSError):
             # It is being deleted; the next look finds it gone.
-            return self._known or {"state": ""}
+            return self._sent or {"state": ""}
 
     def _reports(self) -> Iterator[News]:
         events, self._offset = read_events(self._folder, self._offset)
@@ -166,7 +166,7 @@ class Feed:
         self._epoch = secrets.token_hex(4)
         self._number = 0
         self._changes: deque[tuple[int, str, dict[str, Any]]] = deque(maxlen=_KEPT_EVENTS)
-        self._known: dict[str, dict[str, Any]] | None = None
+        self._runs: dict[str, dict[str, Any]] | None = None
         self._next_look = 0.0
 
     def cursor(self) -> str:
@@ -180,7 +180,7 @@ class Feed:
         with self._lock:
             self._next_look = 0.0
             self._refresh()
-            return self._id(self._number), list((self._known or {}).values())
+            return self._id(self._number), list((self._runs or {}).values())
 
     def since(self, last: str | None) -> list[RunEvent]:
         """Give all changes after the one named; one ``reset`` if they are not known any more."""
@@ -205,19 +205,19 @@ class Feed:
 
     def _refresh(self) -> None:
         started = time.monotonic()
-        if self._known is not None and started < self._next_look:
+        if self._runs is not None and started < self._next_look:
             return
         runs = {run["id"]: run for run in self._look()}
         # Of thousands of runs a look takes long; it may not take all of the server's time.
         ended = time.monotonic()
         self._next_look = started + max(_LOOK_INTERVAL_S, (ended - started) / _LOOK_SHARE)
-        if self._known is not None:
+        if self._runs is not None:
             for run_id, run in runs.items():
-                if self._known.get(run_id) != run:
+                if self._runs.get(run_id) != run:
                     self._add("run", run)
-            for run_id in self._known.keys() - runs.keys():
+            for run_id in self._runs.keys() - runs.keys():
                 self._add("gone", {"id": run_id})
-        self._known = runs
+        self._runs = runs
 
     def _add(self, event: str, data: dict[str, Any]) -> None:
         self._number += 1

@@ -244,9 +244,9 @@ def _chosen_sequences(
     ]
     if query.sort in dict(SEQUENCE_ORDERS) and query.sort:
         name = query.sort.removeprefix("-")
-        known = [sequence for sequence in chosen if sequence.get(name) is not None]
-        known.sort(key=lambda sequence: sequence[name], reverse=query.sort.startswith("-"))
-        chosen = known + [sequence for sequence in chosen if sequence.get(name) is None]
+        with_value = [sequence for sequence in chosen if sequence.get(name) is not None]
+        with_value.sort(key=lambda sequence: sequence[name], reverse=query.sort.startswith("-"))
+        chosen = with_value + [sequence for sequence in chosen if sequence.get(name) is None]
     return chosen
 
 

@@ -26,7 +26,7 @@ _AGAIN = {"Cache-Control": "no-store"}
 
 
 class FrameQuery(BaseModel):
-    """What is drawn of a frame; the fields are the parameters of an address."""
+    """Picture of a frame; the fields are the parameters of an address."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -78,8 +78,8 @@ def add_checks(router: APIRouter, catalog: Catalog, models: ModelFolders, pages:
     def show_problems(request: Request, sequence_id: ItemId) -> HTMLResponse:
         """Read every file, which takes seconds, and give stages and problems."""
         item = catalog.sequence_item(sequence_id)
-        found = check_item(item).to_dict()
-        return pages.render(request, "_checked.html", **found, about=ABOUT, is_whole=True)
+        report = check_item(item).to_dict()
+        return pages.render(request, "_checked.html", **report, about=ABOUT, is_whole=True)
 
     @router.get("/sequences/{sequence_id}/views/{view_name}/frames/{frame}")
     def show_frame(

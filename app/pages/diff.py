@@ -25,7 +25,7 @@ _SPLITS = {"reconstruction": "fitted frames", "future": "predicted frames"}
 _UNCOMPARED = {"description", "aggregation", "unit", "frames"}
 
 _TOLD_ELSEWHERE = {"profile", "edits", "overrides"}
-"""What a configuration has of its own beside settings; those that override a profile are in it."""
+"""Keys of a configuration beside settings; those that override a profile are in it."""
 _CHANGED = "parameters."
 """Settings that begin so are the parameters that a simulation was asked to change."""
 _NOTICED = 0.005
@@ -42,7 +42,7 @@ class ComparedCell:
     is_best: bool = False
     """Whether no other run is better."""
     change: str = ""
-    """How much it differs from the first run."""
+    """Its difference from the first run."""
     moment: str = ""
     """If the text is a time, what browsers show in their own time zone; ISO 8601."""
 
@@ -92,16 +92,16 @@ def compare_runs(
     parameters = [result.get("parameters", {}) for result in results]
     surroundings = [_surroundings_of(result.get("environment", {})) for result in results]
     is_chosen = any(run["kind"] == "simulation" for run in described)
-    found = Section("Parameters that the simulation ended with", _parameter_rows(parameters))
+    ended_with = Section("Parameters that the simulation ended with", _parameter_rows(parameters))
     losses = [_losses_of(result) for result in results]
     sections = [
         Section("Edits of springs and nodes", _edit_rows(configs)),
         Section("The runs", _fact_rows(described)),
-        *([found] if is_chosen else []),
+        *([ended_with] if is_chosen else []),
         Section("Settings", _setting_rows(configs)),
         *_score_sections([_scores_of(result.get("metrics", {})) for result in results]),
         Section("Loss at the end of each stage", _plain_rows(losses, counts_absence=False)),
-        *([] if is_chosen else [found]),
+        *([] if is_chosen else [ended_with]),
         Section("Computed with", _plain_rows(surroundings, counts_absence=False)),
     ]
     return [section for section in sections if section.rows]
@@ -140,13 +140,13 @@ def _setting_rows(configs: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 def _edit_rows(configs: Sequence[Mapping[str, Any]]) -> list[Row]:
     """Lay edits side by side, step by step; those of one name may be of other springs or nodes."""
-    told = [named_fields(config.get("edits")) or {} for config in configs]
+    edits_of_runs = [named_fields(config.get("edits")) or {} for config in configs]
     columns = [
         {f"step {number}": step for number, step in enumerate(edits.get("steps", ()), start=1)}
-        for edits in told
+        for edits in edits_of_runs
     ]
     rows = _plain_rows(columns)
-    hashes = [str(edits.get("sha256", ""))[:_COMMIT_DIGITS] for edits in told]
+    hashes = [str(edits.get("sha256", ""))[:_COMMIT_DIGITS] for edits in edits_of_runs]
     if len(set(hashes)) > 1 and not any(row.differs for row in rows):
         cells = [ComparedCell(text) for text in hashes]
         rows.append(Row("the same steps, of other springs, nodes or frames", cells, differs=True))
@@ -166,8 +166,8 @@ def _plain_rows(columns: Sequence[Mapping[str, Any]], *, counts_absence: bool = 
         if any(value is not None for value in values):
             cells = [ComparedCell(text) for text in _texts(columns, name)]
             shown = " / ".join(words(part.rstrip("_")) for part in name.split("."))
-            told = values if counts_absence else _present(values)
-            rows.append(Row(shown, cells, _differ(told)))
+            compared = values if counts_absence else _present(values)
+            rows.append(Row(shown, cells, _differ(compared)))
     return rows
 
 

@@ -58,8 +58,8 @@ def _free_name(name: str, taken: set[str]) -> str:
     """Suggest a name for a sequence that no other one has."""
     safe = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)[:56]
     safe = safe or "recording"
-    number, found = 1, safe
-    while found in taken:
+    number, free = 1, safe
+    while free in taken:
         number += 1
-        found = f"{safe}_{number}"
-    return found
+        free = f"{safe}_{number}"
+    return free

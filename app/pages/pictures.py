@@ -40,7 +40,7 @@ def add_pictures(router: APIRouter, previews: Previews) -> None:
 
     @router.get("/runs/{run_id}/picture")
     def run_picture(run_id: ItemId) -> dict[str, Any]:
-        return _told(previews, "run", run_id)
+        return _picture_state(previews, "run", run_id)
 
     @router.get("/sequences/{sequence_id}/still")
     def sequence_still(sequence_id: ItemId, v: str = "") -> Response:
@@ -52,10 +52,10 @@ def add_pictures(router: APIRouter, previews: Previews) -> None:
 
     @router.get("/sequences/{sequence_id}/picture")
     def sequence_picture(sequence_id: ItemId) -> dict[str, Any]:
-        return _told(previews, "sequence", sequence_id)
+        return _picture_state(previews, "sequence", sequence_id)
 
 
-def _told(previews: Previews, kind: PreviewKind, item_id: str) -> dict[str, Any]:
+def _picture_state(previews: Previews, kind: PreviewKind, item_id: str) -> dict[str, Any]:
     """Tell a page that waits for a picture whether it is there by now, and where."""
     picture = previews.look(kind, item_id)
     return {"state": picture.state, "still": picture.still, "moving": picture.moving}

@@ -157,8 +157,8 @@ def _add_recovery(
 ) -> None:
     @router.get("/recovery")
     def show_recovery(request: Request) -> HTMLResponse:
-        found, going = recovery.describe(), retention.describe()
-        return pages.render(request, "recovery.html", found=found, going=going)
+        report, going = recovery.describe(), retention.describe()
+        return pages.render(request, "recovery.html", report=report, going=going)
 
 
 def _add_launch(router: APIRouter, catalog: Catalog, overview: Overview, pages: Pages) -> None:

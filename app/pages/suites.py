@@ -111,7 +111,7 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
     def show_suite(
         request: Request, name: Name, query: Annotated[CellQuery, Query()]
     ) -> HTMLResponse:
-        path = _found(folder, name)
+        path = _suite_folder(folder, name)
         content = _read(path)
         about, cells = content.about, content.cells
         return pages.render(
@@ -130,11 +130,11 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
 
     @router.get("/suites/{name}/charts/{chart}")
     def chart(name: Name, chart: Chart) -> Response:
-        return _file(_found(folder, name) / "charts" / chart)
+        return _file(_suite_folder(folder, name) / "charts" / chart)
 
     @router.get("/suites/{name}/files/{file}")
     def file(name: Name, file: File) -> Response:
-        return _file(_found(folder, name) / file)
+        return _file(_suite_folder(folder, name) / file)
 
 
 def _folders(folder: Path) -> list[Path]:
@@ -147,7 +147,7 @@ def _has_page(path: Path) -> bool:
     return re.fullmatch(_NAME, path.name) is not None
 
 
-def _found(folder: Path, name: str) -> Path:
+def _suite_folder(folder: Path, name: str) -> Path:
     path = folder / name
     if not (path / "cells.json").is_file():
         raise UnknownSuiteError(

@@ -1,4 +1,4 @@
-"""Where the camera of a drawn preview stands."""
+"""Camera of a drawn preview."""
 
 import numpy as np
 from jaxtyping import Float

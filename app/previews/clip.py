@@ -33,7 +33,7 @@ class Clip:
     frames: list[UInt8[ndarray, "row column channel"]]
     """Red, green, blue and, where the background is clear, opacity."""
     frame_ms: int
-    """How long each is shown [ms]."""
+    """Duration of each [ms]."""
 
     def write_moving(self, path: Path) -> None:
         """Write the pictures as an animated WebP.

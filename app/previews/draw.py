@@ -20,17 +20,17 @@ _CONTROL = np.array([232.0, 85.0, 74.0])
 _MARKER = np.array([63.0, 174.0, 92.0])
 _SPRING = np.array([[112.0, 160.0, 208.0]])
 _LIGHT = np.array([-0.35, -0.65, -0.67])
-"""Where the light comes from, in the camera's axes."""
+"""Direction of the light, in the camera's axes."""
 _SKIN_SHADING, _OBJECT_SHADING, _POINT_SHADING = 0.9, 0.5, 0.5
 _FADING = 0.3
-"""How much darker the farthest points are than the nearest."""
+"""Darkening of the farthest points relative to the nearest."""
 _SKIN_RADIUS = 1.0
 _SAMPLED_POINTS = 4_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreviewMotion:
-    """What moves in a sequence or a run, in the sequence's own unit of length."""
+    """Moving parts of a sequence or a run, in the sequence's own unit of length."""
 
     hands: tuple[tuple[Float[ndarray, "frame vertex 3"], Int[ndarray, "face 3"] | None], ...] = ()
     """Vertices and triangles of each hand."""
@@ -48,8 +48,8 @@ class PreviewMotion:
     @property
     def tracks(self) -> list[Float[ndarray, "frame point 3"]]:
         """Everything that moves, as points."""
-        found = [vertex for vertex, _ in self.hands]
-        return found + [t for t in (self.node, self.marker, self.control) if t is not None]
+        hand_vertices = [vertex for vertex, _ in self.hands]
+        return hand_vertices + [t for t in (self.node, self.marker, self.control) if t is not None]
 
     @property
     def frame_count(self) -> int:

@@ -1,4 +1,4 @@
-"""Which markers are neighbors, so that lines can join them."""
+"""Pairs of neighboring markers, which lines join."""
 
 import numpy as np
 from jaxtyping import Float, Int

@@ -13,7 +13,7 @@ from physhandi.data.view import View
 WIDTH = 960
 """Width of a drawn frame [px]."""
 LAYERS = ("mask", "keypoint", "track")
-"""What can be drawn over a picture."""
+"""Overlays of a picture."""
 _QUALITY = 85
 _LABEL_COLOR = np.array([[0, 0, 0], [74, 155, 232], [233, 149, 60], [166, 108, 230]], np.float32)
 """Colors of object, right and left hand in masks (RGB), as the legend of the page has them."""

@@ -26,7 +26,7 @@ PreviewKind = Literal["run", "sequence"]
 _VERSION = 2
 _BATCH = 8
 _FAULTLESS = (0, -signal.SIGTERM, -signal.SIGINT)
-"""How a process ends that is not to blame for what is missing: as it should, or from outside."""
+"""Exit codes of a process that is not to blame for what is missing: a regular end, or a signal."""
 _PATIENCE = 10.0
 """Time that a preview may take by the clock, in its processor time."""
 _MOST_WAITING = 400

@@ -31,7 +31,7 @@ _GONE = (
 _MOST_REFUSED = 20
 """So many messages that are none, and the page that sends them is hung up on."""
 _LEAVING_S = 1.2
-"""How long the page that a tab has left may take to hang up."""
+"""Time that the page that a tab has left may take to disconnect [s]."""
 
 
 def create_gate(sessions: Sessions) -> APIRouter:

@@ -47,7 +47,7 @@ from physhandi.data.exporters.scene_data import read_skins
 from physhandi.fitting.stored_take import StoredTake
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import parameter_changes
-from physhandi.simulation.steering import Take
+from physhandi.simulation.steering import SteeredMotion
 
 
 class Session(SceneServer):
@@ -189,7 +189,7 @@ class Session(SceneServer):
 
     @property
     def camera_path(self) -> CameraPath | None:
-        """What the camera of a film follows; None if it stands still."""
+        """Path of a film's camera; None if it stands still."""
         return self._path.path
 
     def go(self, frame: int) -> None:
@@ -310,7 +310,7 @@ class Session(SceneServer):
             stop_comparing=self._comparison.stop,
             newtons=lambda: scene.painter.force_factor,
             skins=partial(read_skins, run, content.sequence_name),
-            keep=None if self._storage is None else self._keep_take,
+            keep=None if self._storage is None else self._keep_motion,
         )
         self._edit = EditPanel(
             self._server,
@@ -341,16 +341,16 @@ class Session(SceneServer):
             self._steer.leave()
         self._comparison.stop()
 
-    def _keep_take(
-        self, take: Take, frame: int, name: str, report: Callable[[SavedRun], None]
+    def _keep_motion(
+        self, motion: SteeredMotion, frame: int, name: str, report: Callable[[SavedRun], None]
     ) -> None:
         """Have a run and a recording made of what was steered."""
         storage, fitted = self._storage, self._content.fitted
         if storage is None or fitted is None:
             return
         source = self._catalog.run(self._target)
-        changes = run_changes(source, fitted.parameters, take.parameters, is_automatic=False)
-        stored = StoredTake(take=take, sequence=self._content.sequence_name, frame=frame)
+        changes = run_changes(source, fitted.parameters, motion.parameters, is_automatic=False)
+        stored = StoredTake(take=motion, sequence=self._content.sequence_name, frame=frame)
         run = storage.saver.save_take(self._target, stored, name, changes)
         storage.tell("keep a take", run)
         storage.saver.follow(run, report, self._gone)

@@ -33,7 +33,7 @@ class TooManySessionsError(PhysHandiError):
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedSession:
-    """What is remembered of a session that was closed."""
+    """Record of a session that was closed."""
 
     kind: Kind
     """Whether it showed a run, a sequence or two runs together."""

@@ -1,4 +1,4 @@
-"""What is written about viser connections that fail, which whoever connects can bring about."""
+"""Log of failed viser connections, which anybody who connects can cause."""
 
 import logging
 import threading
@@ -40,9 +40,9 @@ class BrokenConnections(logging.Filter):
             left_out, self._left_out = self._left_out, 0
         error = record.exc_info[1]
         # As repr, since it may quote what was sent.
-        told = f"{record.getMessage()}: {type(error).__name__}: {describe(error)[:200]!r}"
+        text = f"{record.getMessage()}: {type(error).__name__}: {describe(error)[:200]!r}"
         more = f" ({left_out} more were left out)" if left_out else ""
-        record.msg, record.args = f"a viewer's {told}{more}", ()
+        record.msg, record.args = f"a viewer's {text}{more}", ()
         record.exc_info = record.exc_text = None
         return True
 

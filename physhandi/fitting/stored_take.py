@@ -12,7 +12,7 @@ from physhandi.data.files import named_fields, write_bytes
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.steering import Take
+from physhandi.simulation.steering import SteeredMotion
 
 TAKE_FILE = "take.safetensors"
 """File of a run's folder that holds its take."""
@@ -22,7 +22,7 @@ TAKE_FILE = "take.safetensors"
 class StoredTake:
     """A take, and from where in a run it was steered."""
 
-    take: Take
+    take: SteeredMotion
     """The take."""
     sequence: str
     """Sequence of the run that the object was fitted in."""
@@ -58,7 +58,7 @@ class StoredTake:
             return None
         with reading(run.folder / TAKE_FILE):
             parameters = SimulationParameters.from_dict(about["parameters"])
-            take = Take.from_tensors(read_tensors(run.folder / TAKE_FILE), parameters)
+            take = SteeredMotion.from_tensors(read_tensors(run.folder / TAKE_FILE), parameters)
             return cls(take=take, sequence=str(about["sequence"]), frame=int(about["frame"]))
 
 

@@ -1,9 +1,10 @@
-"""An object whose hands somebody steers: frame by frame, from any state on, and as takes of it.
+"""An object whose hands somebody steers: frame by frame, from any state on, or as one motion.
 
 A steered hand moves about its wrist and bends its fingers, and else keeps the shape that it had;
-what it holds at the start of a take it holds throughout. A hand that lets go or grips anew, and a
-point of the object that is held by itself, begin another take. A take is the poses of its hands
-over the frames beside the state that it begins in, so that simulating it again gives the same bits.
+what it holds at the start of a motion it holds throughout. A hand that lets go or grips anew, and
+a point of the object that is held by itself, begin another motion. A motion is the poses of its
+hands over the frames beside the state that it begins in, so that simulating it again gives the same
+bits. Pages and the files of runs call it a take.
 """
 
 import math
@@ -195,7 +196,7 @@ class SteeredHand:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Take:
+class SteeredMotion:
     """Poses of hands over some frames, and the state of the object that they begin with."""
 
     model: SpringMassModel
@@ -282,7 +283,7 @@ class Take:
         return float(min(ground, self.control[its.control, 2].min()) - lowest)
 
     def simulate(self, device: str = "cpu") -> Iterator[NodeState]:
-        """Simulate the frames one after the other; the first is the state that the take begins in.
+        """Simulate the frames one after the other; the first is the state in `start`.
 
         Args:
             device: Warp device.
@@ -299,8 +300,10 @@ class Take:
         """Whether a virtual spring joins a hand to the object."""
         return bool(self._springs_of(hand).any())
 
-    def let_go(self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]) -> "Take":
-        """Begin another take, in which a hand holds nothing.
+    def let_go(
+        self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]
+    ) -> "SteeredMotion":
+        """Begin another motion, in which a hand holds nothing.
 
         Args:
             hand: Number of the hand.
@@ -309,14 +312,16 @@ class Take:
         """
         return self._rejoined(~self._springs_of(hand), state, pose)
 
-    def grip(self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]) -> "Take":
-        """Begin another take, in which a hand holds what is near its control nodes.
+    def grip(
+        self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]
+    ) -> "SteeredMotion":
+        """Begin another motion, in which a hand holds what is near its control nodes.
 
         The arguments are those of `let_go`. Nodes are near that are nearer than
         ``virtual_connection_radius``, at most ``virtual_max_neighbors`` for each control node.
 
         Returns:
-            The take; in it the hand holds nothing if nothing is near.
+            The motion; in it the hand holds nothing if nothing is near.
         """
         own, parameters = self.hands[hand].control, self.parameters
         control = self.control_at(pose)
@@ -332,8 +337,8 @@ class Take:
 
     def hold_point(
         self, node: int, state: NodeState, pose: Float[ndarray, "hand pose"], name: str
-    ) -> "Take":
-        """Begin another take, in which the object is held at one more point, by a hand of its own.
+    ) -> "SteeredMotion":
+        """Begin another motion, in which a hand of its own holds the object at one more point.
 
         The hand is one control node a little above the object node, joined to that and to what is
         near it, as control nodes of real hands are.
@@ -345,7 +350,7 @@ class Take:
             name: What the hand is called.
 
         Returns:
-            The take; its last hand is the new one, in the pose of zero.
+            The motion; its last hand is the new one, in the pose of zero.
         """
         model, parameters = self.model, self.parameters
         own = model.control_count - model.pin_count  # Control nodes that never move are the last.
@@ -377,8 +382,8 @@ class Take:
 
     def without_point(
         self, hand: int, state: NodeState, pose: Float[ndarray, "hand pose"]
-    ) -> "Take":
-        """Begin another take, in which a point is held no more; the arguments are `let_go`'s."""
+    ) -> "SteeredMotion":
+        """Begin another motion, in which a point is held no more; the arguments are `let_go`'s."""
         free = self.let_go(hand, state, pose)
         gone, model = self.hands[hand].control, free.model
         remaining = np.setdiff1d(np.arange(model.control_count), gone)
@@ -411,8 +416,8 @@ class Take:
         state: NodeState,
         pose: Float[ndarray, "hand pose"],
         joined: tuple[Int[ndarray, "new 2"], Float[ndarray, " new"]] | None = None,
-    ) -> "Take":
-        """Begin another take with other virtual springs, and with more substeps if they need it.
+    ) -> "SteeredMotion":
+        """Begin another motion with other virtual springs, and with more substeps if they need it.
 
         Args:
             stays: Springs that stay.
@@ -447,7 +452,7 @@ class Take:
                 taken = replace(taken, parameters=parameters.replace(substeps_per_frame=needed))
         return taken
 
-    def part(self, first: int, last: int, state: NodeState) -> "Take":
+    def part(self, first: int, last: int, state: NodeState) -> "SteeredMotion":
         """Keep some frames.
 
         Args:
@@ -459,7 +464,7 @@ class Take:
             raise ValueError(f"frames {first} to {last} are not among the {self.frame_count}.")
         return replace(self, start=state, pose=self.pose[first : last + 1].copy())
 
-    def smoothed(self, seconds: float) -> "Take":
+    def smoothed(self, seconds: float) -> "SteeredMotion":
         """Take jitter out of the poses; the first one, to which the object's state belongs, stays.
 
         Args:
@@ -516,7 +521,7 @@ class Take:
     @classmethod
     def from_tensors(
         cls, tensors: Mapping[str, ndarray], parameters: SimulationParameters
-    ) -> "Take":
+    ) -> "SteeredMotion":
         """Rebuild it from the arrays of `to_tensors`.
 
         Raises:
@@ -584,24 +589,26 @@ def _named(tensors: Mapping[str, ndarray], prefix: str) -> dict[str, ndarray]:
 
 
 class SteeredSimulation:
-    """An object that goes on from the state of a take, a frame for each pose that it is given."""
+    """An object that goes on from the state of a motion, a frame for each pose that it is given."""
 
-    def __init__(self, take: Take, device: str = "cpu") -> None:
-        """Place the object on a device, in the first frame of a take.
+    def __init__(self, motion: SteeredMotion, device: str = "cpu") -> None:
+        """Place the object on a device, in the first frame of a motion.
 
         Args:
-            take: Its model, control nodes and first poses.
+            motion: Its model, control nodes and first poses.
             device: Warp device.
         """
-        from physhandi.simulation.simulator import Simulator  # Whoever shows a take runs no Warp.
+        from physhandi.simulation.simulator import Simulator  # Whoever shows a motion runs no Warp.
 
-        self._take = take
-        self._simulator = Simulator(take.model, take.parameters, device=device)
-        self._simulator.reset(*take.start)
-        self._control = take.control_at(take.pose[0])
+        self._motion = motion
+        self._simulator = Simulator(motion.model, motion.parameters, device=device)
+        self._simulator.reset(*motion.start)
+        self._control = motion.control_at(motion.pose[0])
         self._control_velocity = np.zeros_like(self._control)
-        ends = take.model.spring_nodes[take.model.object_spring_count :].max(axis=1)
-        self._springs = [np.isin(ends - take.model.node_count, hand.control) for hand in take.hands]
+        ends = motion.model.spring_nodes[motion.model.object_spring_count :].max(axis=1)
+        self._springs = [
+            np.isin(ends - motion.model.node_count, hand.control) for hand in motion.hands
+        ]
         self.frame = 0
         """Frames that have been simulated."""
 
@@ -617,10 +624,10 @@ class SteeredSimulation:
         Raises:
             SimulationDivergedError: If a node is not finite or too fast.
         """
-        control = self._take.control_at(pose)
+        control = self._motion.control_at(pose)
         self.frame += 1
         self._simulator.step_frame(self.frame, self._control, control)
-        rate = self._take.parameters.simulated_frame_rate
+        rate = self._motion.parameters.simulated_frame_rate
         self._control_velocity = rate * (control - self._control)
         self._control = control
         return self.state
@@ -631,6 +638,6 @@ class SteeredSimulation:
         Args:
             state: The newest state, as `step` gives it.
         """
-        take, moved = self._take, self._control_velocity
-        force = virtual_spring_forces(take.model, take.parameters, *state, self._control, moved)
+        motion, moved = self._motion, self._control_velocity
+        force = virtual_spring_forces(motion.model, motion.parameters, *state, self._control, moved)
         return np.stack([-force[own].sum(axis=0) for own in self._springs])

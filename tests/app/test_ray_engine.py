@@ -23,6 +23,7 @@ from app.jobs.worker import fill_run
 from app.settings import ServerSettings
 from physhandi import pipeline
 from physhandi.data.attempt import Attempt
+from physhandi.data.lease import live_holder
 from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
 from physhandi.run_store import RunStore
@@ -305,7 +306,16 @@ def test_a_server_that_was_killed_while_it_submitted_submits_the_same_job(
     assert after.told(run_id) == ("starting", "Loading the program.")
 
 
-def test_a_stop_is_told_only_when_nothing_is_left(desk: ClusterDesk, cluster: MadeCluster) -> None:
+def test_a_stop_is_told_only_when_nothing_is_left(
+    desk: ClusterDesk, cluster: MadeCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workers: list[Any] = []
+
+    def look(run_folder: Path) -> Any:
+        workers.append(live_holder(run_folder))
+        return workers[-1]
+
+    monkeypatch.setattr(ray_engine, "live_holder", look)
     run_id = desk.launch()
     desk.step()
     attempt = desk.begin(run_id, cluster.submitted[0])
@@ -314,15 +324,17 @@ def test_a_stop_is_told_only_when_nothing_is_left(desk: ClusterDesk, cluster: Ma
     desk.scheduler.cancel(run_id)
     until(lambda: len(cluster.stopped) > 2)
     assert desk.view(run_id).state == "stopping"
-    cluster.set("STOPPED")
-    asked = len(cluster.stopped)
     thread = desk.scheduler._stopping[run_id]
-    # It goes on waiting for the worker, which still renews its claim.
-    thread.join(0.05)
-    assert thread.is_alive()
-    assert len(cluster.stopped) - asked <= 1
+    assert workers == []
+    cluster.set("STOPPED")
+    # It goes on waiting for the worker, which still renews its claim, and asks the cluster no more.
+    until(lambda: len(workers) > 2)
+    assert None not in workers
+    assert desk.view(run_id).state == "stopping"
+    asked = len(cluster.stopped)
     attempt._lease.release()
     thread.join(LIMIT_S)
+    assert len(cluster.stopped) == asked
     assert desk.view(run_id).state == "cancelled"
     assert not (desk.folder(run_id) / STARTED).exists()
 

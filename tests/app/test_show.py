@@ -39,3 +39,9 @@ def test_a_viewer_that_does_not_start_says_why(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(viewer_process, "start_module", start_nothing)
     with pytest.raises(RunError, match=r"could not be started: .*no_such_module"):
         ph.open_run(BUNDLED).show(opens_browser=False)
+
+
+def test_a_viewer_that_does_not_answer_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer_process, "_PATIENCE_S", 0.0)
+    with pytest.raises(RunError, match="could not be started: it said nothing"):
+        ph.open_run(BUNDLED).show(opens_browser=False)

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Error as PlaywrightError
 from playwright.sync_api import expect
 from scene_page import ScenePage
 from viewer_world import FolderCatalog
@@ -47,7 +46,7 @@ def shot_of(scene: ScenePage) -> np.ndarray:
     """What the scene shows left of the panel."""
     # What arrives while a picture is drawn may be missing in it until something asks for another.
     scene.panel.locator("body").evaluate("() => window.__viserMutable?.requestRender()")
-    scene.page.wait_for_timeout(600)
+    scene.draw()
     shot = scene.page.screenshot(clip={"x": 330, "y": 60, "width": 600, "height": 700})
     return cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
 
@@ -62,19 +61,17 @@ def yellow(image: np.ndarray) -> int:
     return int(((image[..., 0] > 120) & (image[..., 1] > 180) & (image[..., 2] < 100)).sum())
 
 
-def goes_to_a_frame_of_the_chart(scene: ScenePage) -> bool:
-    """Click into a chart over frames; tells whether the scene went there."""
+def go_by_the_chart(scene: ScenePage) -> None:
+    """Click into a chart over frames, at three quarters of its width."""
     chart = scene.panel.locator(".u-over").first
-    try:
-        chart.scroll_into_view_if_needed()
+
+    def width() -> float:
         box = chart.bounding_box()
-        if box is None:
-            return False
-        scene.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
-        scene.page.wait_for_timeout(500)
-    except PlaywrightError:
-        return False  # The readings were just written anew, and the chart with them.
-    return abs(scene.value("Frame") - 0.75 * 59) <= 1
+        return 0.0 if box is None else box["width"]
+
+    scene.until(lambda: width() > 0.0, "the chart has its size")
+    chart.click(position={"x": 0.75 * width(), "y": 20.0})
+    scene.until(lambda: abs(scene.value("Frame") - 0.75 * 59) <= 1, "the frame in the chart")
 
 
 def blue_at_rest(scene: ScenePage) -> int:
@@ -130,7 +127,7 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(shared_scene, pi
     speed = 30 * np.linalg.norm(rollout[FRAME, named] - rollout[FRAME - 1, named])
     assert scene.number("velocity", text=reading) == pytest.approx(speed, rel=0.01)
 
-    scene.until(lambda: goes_to_a_frame_of_the_chart(scene), "the frame in the chart")
+    go_by_the_chart(scene)
 
     press_and_see(scene, "3", "show")
     picture(page, "inspect")

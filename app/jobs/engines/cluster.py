@@ -27,7 +27,7 @@ class ClusterError(RunError):
 
 @dataclass(frozen=True)
 class Demand:
-    """What a job asks of the node that it runs on."""
+    """Resources that a job requests of the node that it runs on."""
 
     cpus: int = 1
     """Processors."""
@@ -48,14 +48,14 @@ class Demand:
 
 @dataclass(frozen=True)
 class ClusterJob:
-    """What a cluster knows of a job."""
+    """State of a job, as the cluster reports it."""
 
     status: str
     """PENDING, RUNNING, SUCCEEDED, FAILED or STOPPED."""
     message: str = ""
-    """What it tells of it."""
+    """The cluster's message about it."""
     metadata: Mapping[str, Any] | None = None
-    """What was given with it."""
+    """Metadata that was submitted with it."""
 
 
 class Cluster:
@@ -98,8 +98,12 @@ class Cluster:
         if status == 200:
             return
         # It may have been taken before, by a request whose answer was lost.
-        known = self.job(job)
-        if known is None or known.metadata is None or dict(known.metadata) != dict(metadata):
+        existing = self.job(job)
+        if (
+            existing is None
+            or existing.metadata is None
+            or dict(existing.metadata) != dict(metadata)
+        ):
             raise self._error(status, content)
 
     def job(self, job: str) -> ClusterJob | None:
@@ -112,10 +116,10 @@ class Cluster:
         if status == 404:
             return None
         fields = self._fields(status, content)
-        told = fields.get("status")
-        if not isinstance(told, str):
+        state = fields.get("status")
+        if not isinstance(state, str):
             raise self._error(status, content)
-        return ClusterJob(told, str(fields.get("message") or ""), named_fields(fields["metadata"]))
+        return ClusterJob(state, str(fields.get("message") or ""), named_fields(fields["metadata"]))
 
     def stop(self, job: str) -> None:
         """Ask for the end of a job; one that still waits may be begun all the same.

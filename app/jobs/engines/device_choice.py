@@ -33,7 +33,7 @@ class DeviceChoice:
         self._least = settings.fit_memory_gib * _GIBIBYTE
         self._cards = cards
         self._card_of = card_of
-        self._known: dict[str, str | None] = {}
+        self._card_by_device: dict[str, str | None] = {}
 
     def choose(self, busy: Sequence[str]) -> str | None:
         """Choose the device of the next fit.
@@ -53,19 +53,19 @@ class DeviceChoice:
     def card(self, device: str) -> str | None:
         """Tell the graphics card of one of the devices; None for a CPU."""
         # Asked when a fit is placed: who only looks at a data folder starts no Warp.
-        if device not in self._known:
-            self._known[device] = None if device == "cpu" else self._card_of(device)
-        return self._known[device]
+        if device not in self._card_by_device:
+            self._card_by_device[device] = None if device == "cpu" else self._card_of(device)
+        return self._card_by_device[device]
 
     @property
     def shortage(self) -> str:
         """Why no device can be chosen, as a sentence."""
-        told = ", ".join(
+        memory = ", ".join(
             f"{device} has {(self._free(device) or 0.0) / _GIBIBYTE:.1f} GiB"
             for device in self._devices
         )
         return (
-            f"Waits for memory of a GPU: {told} free, and a fit is started with "
+            f"Waits for memory of a GPU: {memory} free, and a fit is started with "
             f"{self._least / _GIBIBYTE:g} GiB."
         )
 

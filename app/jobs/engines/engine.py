@@ -1,4 +1,4 @@
-"""Where the processes of fits run: on this machine, or on a cluster."""
+"""Engines, on which the processes of fits run: this machine, or a cluster."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ class Engine(Protocol):
 
     @property
     def slots(self) -> int:
-        """How many fits it runs side by side."""
+        """Number of fits that it runs side by side."""
         ...
 
     @property
@@ -71,7 +71,7 @@ class Engine(Protocol):
         """Tell whether a run's supervisor lives; what cannot be found out counts as alive."""
         ...
 
-    def told(self, run_folder: Path) -> str:
+    def waits_for(self, run_folder: Path) -> str:
         """Tell of a run whose supervisor lives, but not its worker, what it waits for."""
         ...
 

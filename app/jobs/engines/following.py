@@ -118,12 +118,12 @@ class FollowedRun:
         """Give the latest report; while nobody works on the run, its stage says what it awaits."""
         if live_holder(self.folder) is not None:
             with suppress(RunError):  # A damaged report costs no more than the report.
-                told = read_record(self.folder / PROGRESS, EventLine)
-                if told is not None:
-                    return told
+                latest = read_record(self.folder / PROGRESS, EventLine)
+                if latest is not None:
+                    return latest
         ticket = read_ticket(self.folder / STARTED) or Ticket()
         engine = self._engine
-        waits = self._hindrance or engine.trouble or engine.told(self.folder)
+        waits = self._hindrance or engine.trouble or engine.waits_for(self.folder)
         return {"stage": " ".join(part for part in (ticket.remark, waits) if part).rstrip(".")}
 
     def end(self) -> None:
@@ -148,8 +148,8 @@ class FollowedRun:
         if end is None or end["state"] == "cancelled":
             raise CancelledError(f"Run '{self.folder.name}' was cancelled.")
         if end["state"] == "failed":
-            told = end.get("error") or "It failed without a reason."
-            raise error_of({"error": told, "kind": end.get("error_type")})
+            reason = end.get("error") or "It failed without a reason."
+            raise error_of({"error": reason, "kind": end.get("error_type")})
 
     def _start(self) -> None:
         device = self._engine.choose(())
@@ -177,10 +177,10 @@ def follow_to_end(run: FollowedRun, engine: Engine, progress: Progress, grace_s:
     """
     try:
         while not run.look():
-            told = run.report()
-            count, total = int(told.get("iteration", 0)), int(told.get("total", 0))
-            loss, message = told.get("loss"), told.get("message", "")
-            progress.report(told["stage"], count, total, loss, message)
+            report = run.report()
+            count, total = int(report.get("iteration", 0)), int(report.get("total", 0))
+            loss, message = report.get("loss"), report.get("message", "")
+            progress.report(report["stage"], count, total, loss, message)
             progress.check_cancelled()
             time.sleep(_INTERVAL_S)
             engine.refresh()

@@ -94,7 +94,7 @@ class LocalEngine:
         is_started = started is not None and started.poll() is None
         return is_started or supervisor_of(run_folder) is not None
 
-    def told(self, run_folder: Path) -> str:  # noqa: ARG002  # the same for all
+    def waits_for(self, run_folder: Path) -> str:  # noqa: ARG002  # the same for all
         """See `Engine`."""
         return "Loading the program."
 

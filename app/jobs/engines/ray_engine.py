@@ -152,7 +152,7 @@ class RayEngine:
         """See `Engine`."""
         return self._status_of(run_folder) in _ALIVE
 
-    def told(self, run_folder: Path) -> str:
+    def waits_for(self, run_folder: Path) -> str:
         """See `Engine`."""
         if self._trouble:
             return f"{self._trouble} Whether it still runs is known when it does."
@@ -198,10 +198,10 @@ class RayEngine:
 
     def _look(self, job: str) -> str:
         """Ask how a job is and keep the answer."""
-        found = self._cluster.job(job)
+        answer = self._cluster.job(job)
         with self._lock:
-            self._status[job] = "LOST" if found is None else found.status
-            self._message[job] = "" if found is None else found.message
+            self._status[job] = "LOST" if answer is None else answer.status
+            self._message[job] = "" if answer is None else answer.message
             return self._status[job]
 
 

@@ -15,7 +15,7 @@ _LONGEST_S = 4 * 3600.0
 
 @dataclass
 class BackgroundTask:
-    """How far a piece of work is."""
+    """Progress of a piece of work."""
 
     state: Literal["none", "running", "done", "cancelled", "failed"] = "none"
     reason: str = ""
@@ -23,12 +23,12 @@ class BackgroundTask:
     progress: dict[str, Any] = field(default_factory=dict[str, Any])
     """The latest report: ``stage iteration total message``."""
     result: dict[str, Any] = field(default_factory=dict[str, Any])
-    """What the process told about what it has made."""
+    """Result that the process reported."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a piece of work is, for those who must not come in its way."""
+    """Description of a piece of work, for other work that must not interfere with it."""
 
     kind: Literal["annotation", "import", "example", "upload"]
     name: str

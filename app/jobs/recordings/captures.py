@@ -22,9 +22,9 @@ class CaptureEntry:
     """A folder or bag that is listed."""
 
     name: str
-    """What it is called."""
+    """Its name."""
     place: str
-    """What it is asked for by: the folder's name and the way from there, with slashes."""
+    """Path by which it is requested: the folder's name and the way from there, with slashes."""
     is_bag: bool
     """Whether it is a bag."""
 
@@ -64,12 +64,12 @@ class CaptureFolders:
         folder = self.find(place)
         if not folder.is_dir():
             return []
-        found: list[CaptureEntry] = []
+        entries: list[CaptureEntry] = []
         for path in sorted(folder.iterdir(), key=natural_key):
             is_bag = path.is_file() and path.suffix.lower() in BAG_SUFFIXES
             if (is_bag or path.is_dir()) and self._look(f"{place}/{path.name}") is not None:
-                found.append(CaptureEntry(path.name, f"{place}/{path.name}", is_bag))
-        return found[:_MOST_LISTED]
+                entries.append(CaptureEntry(path.name, f"{place}/{path.name}", is_bag))
+        return entries[:_MOST_LISTED]
 
     def find(self, place: str) -> Path:
         """Find a folder or file.

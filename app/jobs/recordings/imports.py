@@ -86,12 +86,12 @@ class Imports:
             "source": str(self.folders.find(source)),
             "options": self._options(intrinsics) | {"depth_scale": depth_scale},
         }
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         with self._looking, Child(self._worker, time_limit_s=_SURVEY_S) as child:
             child.send(order)
             for message in child.messages():
-                found = message.get("result", found)
-        return found
+                result = message.get("result", result)
+        return result
 
     def start(self, order: ImportOrder) -> BackgroundTask:
         """Begin an import; one that was stopped goes on where it was.

@@ -21,9 +21,9 @@ class ModelEntry:
     name: str
     """Name of its folder."""
     finds: Finds
-    """What it finds; what finds tracks is code, which is executed."""
+    """Kind of annotation that it makes; networks for tracks are code, which is executed."""
     kind: str
-    """What it is, as provenance calls it."""
+    """Its kind, as provenance calls it."""
 
 
 class ModelFolders:
@@ -44,14 +44,14 @@ class ModelFolders:
         """
         if not self.folder.is_dir():
             return []
-        found: list[ModelEntry] = []
+        entries: list[ModelEntry] = []
         for path in sorted(self.folder.iterdir()):
             for finds, kind in _KINDS.items():
                 try:
-                    found.append(ModelEntry(path.name, finds, kind(path)))
+                    entries.append(ModelEntry(path.name, finds, kind(path)))
                 except UsageError:
                     continue
-        return found
+        return entries
 
     def find(self, name: str, finds: Finds) -> Path:
         """Find the folder of a network.

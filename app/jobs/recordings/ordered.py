@@ -14,7 +14,7 @@ _POLITENESS = 5
 _LEAST_PAUSE_S = 0.2
 
 
-class _Told(Progress):
+class _ReportedProgress(Progress):
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
         self._last = 0.0
@@ -51,13 +51,13 @@ def work_on_order(work: Callable[[dict[str, Any], Progress], dict[str, Any]]) ->
         os.nice(_POLITENESS)
         requests = channel.requests()
         order: dict[str, Any] = next(requests)
-        told = _Told(channel)
+        progress = _ReportedProgress(channel)
 
         def hear() -> None:
             for _ in requests:
-                told.is_cancelled.set()
+                progress.is_cancelled.set()
 
         threading.Thread(target=hear, daemon=True).start()
-        channel.tell(result=work(order, told))
+        channel.tell(result=work(order, progress))
 
     run_child(begin)

@@ -45,7 +45,7 @@ _LONGEST_LIST = 400 * MOST_FILES
 _END, _END_64, _FAR = b"PK\x05\x06", b"PK\x06\x06", 0xFFFFFFFF
 _KINDS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 _OF_RUNS = {JOB, RUN, CURRENT, EVENTS, EXIT, LOG, PROGRESS, ATTEMPTS}
-"""What is kept of a run: a ticket of another server's queue, say, would start it here."""
+"""Unpacked files of a run; a ticket of another server's queue, say, would start it here."""
 _OF_ATTEMPTS = {OUT, MANIFEST, STAGES_FILE}
 
 

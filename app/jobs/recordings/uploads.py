@@ -108,10 +108,10 @@ class Uploads:
             )
         with self._lock:
             self._forget_old()
-            known = self.unfinished()
-            if len(known) >= _MOST_UPLOADS:
+            unfinished = self.unfinished()
+            if len(unfinished) >= _MOST_UPLOADS:
                 raise UsageError(f"{_MOST_UPLOADS} uploads are unfinished. Remove some of them.")
-            waiting = sum(one["total"] - one["received"] for one in known)
+            waiting = sum(one["total"] - one["received"] for one in unfinished)
             self._data.require("The upload, with others that are unfinished,", total + waiting)
             self._require_room(total + waiting)
             upload_id = secrets.token_hex(8)
@@ -125,11 +125,11 @@ class Uploads:
         if not self._folder.is_dir():
             return []
         folders = sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)
-        found: list[dict[str, Any]] = []
+        uploads: list[dict[str, Any]] = []
         for folder in folders:
             with suppress(UnknownUploadError):  # What was never announced goes with the old ones.
-                found.append(self.describe(folder.name))
-        return [one for one in found if "files" in one]
+                uploads.append(self.describe(folder.name))
+        return [one for one in uploads if "files" in one]
 
     def describe(self, upload_id: str) -> dict[str, Any]:
         """Tell how far an upload is.

@@ -1,1 +1,1 @@
-"""What is damaged or was left behind in a data folder, and how it is mended."""
+"""Recovery of a data folder: damaged items, and leftovers of killed processes."""

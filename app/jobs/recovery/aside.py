@@ -20,13 +20,13 @@ class MovedFolder:
     """A folder that was moved aside."""
 
     kind: ItemKind
-    """What it was."""
+    """Its kind."""
     name: str
     """Its name below ``damaged/<kind>/``; its old one, with a number if that was taken."""
     time: str
-    """When it was moved, ISO 8601; empty if the note beside it is gone."""
+    """Time of the move, ISO 8601; empty if the note beside it is gone."""
     why: str
-    """What was wrong with it."""
+    """Its defect."""
 
 
 def move_aside(folder: Path, kind: ItemKind, damaged_dir: Path, why: str) -> MovedFolder:
@@ -61,12 +61,12 @@ def move_aside(folder: Path, kind: ItemKind, damaged_dir: Path, why: str) -> Mov
 
 def moved_folders(damaged_dir: Path) -> list[MovedFolder]:
     """List what was moved aside, the newest first."""
-    found = [
+    folders = [
         _read(folder, kind)
         for kind in get_args(ItemKind)
         for folder in sorted((damaged_dir / kind).glob("[!.]*/"))
     ]
-    return sorted(found, key=lambda moved: moved.time, reverse=True)
+    return sorted(folders, key=lambda moved: moved.time, reverse=True)
 
 
 def _read(folder: Path, kind: ItemKind) -> MovedFolder:

@@ -1,4 +1,4 @@
-"""What killed processes leave in a data folder, and how it is tidied."""
+"""Leftovers of killed processes in a data folder, and their removal."""
 
 import os
 import shutil
@@ -17,7 +17,7 @@ from physhandi.errors import RunError
 
 @dataclass(frozen=True)
 class LeftBehind:
-    """What processes that are gone have left in a data folder."""
+    """Leftovers of ended processes in a data folder."""
 
     temporaries: tuple[Path, ...] = ()
     """Files and folders that were never finished, and runs that were only half deleted."""

@@ -1,4 +1,4 @@
-"""What the server found in its data folder and mended, for its page and the API."""
+"""Recovery of the server's data folder, for its page and the API."""
 
 import logging
 import threading
@@ -23,18 +23,18 @@ class DamagedFolder:
     """A run or sequence that cannot be read."""
 
     kind: ItemKind
-    """What it is."""
+    """Its kind."""
     id: str
     """Name of its folder."""
     why: str
-    """What is wrong with it; names file and field."""
+    """Its defect; names file and field."""
 
 
 def damaged_folders(catalog: Catalog, scheduler: Scheduler) -> list[DamagedFolder]:
     """List the runs and sequences of the data folder that cannot be read."""
     runs = ((item, scheduler.view(item)) for item in catalog.runs() if not item.is_bundled)
-    found = [DamagedFolder("runs", i.id, v.reason) for i, v in runs if v.state == "damaged"]
-    return found + [
+    damaged_runs = [DamagedFolder("runs", i.id, v.reason) for i, v in runs if v.state == "damaged"]
+    return damaged_runs + [
         DamagedFolder("sequences", item.id, item.error)
         for item in catalog.sequences()
         if item.error is not None and not item.is_bundled

@@ -1,4 +1,4 @@
-"""What of a data folder may go after a time or beyond a size; nothing, unless that is set.
+"""Retention: what is removed from a data folder after a time or beyond a size; nothing by default.
 
 No rule touches what a run was asked for, how it ended, or what it has published, so every run,
 shared page and link stays what it is. What goes is what can be computed again, or tells how an
@@ -37,7 +37,7 @@ class Expendable:
     kind: ExpendableKind
     """Attempts of a run, its log and last preview, a file of the cache, or an upload."""
     name: str
-    """Where it is in the data folder."""
+    """Its path in the data folder."""
     bytes: int
     """Space that is free afterwards."""
     days: float
@@ -106,14 +106,16 @@ class Retention:
     def listed(self) -> list[Expendable]:
         """List what would go now, without changing anything."""
         now = self._clock()
-        found = list(self._of_runs(now))
-        found += self._of_cache(now)
+        expendable = list(self._of_runs(now))
+        expendable += self._of_cache(now)
         limit = self._settings.keep_uploads_days
         for upload_id, folder, touched in self._uploads.left_alone():
             if limit is not None and (days := (now - touched) / _DAY_S) > limit:
                 rule, size = "PHYSHANDI_KEEP_UPLOADS_DAYS", freed_by([folder])
-                found.append(Expendable("upload", self._named(folder), size, days, rule, upload_id))
-        return found
+                expendable.append(
+                    Expendable("upload", self._named(folder), size, days, rule, upload_id)
+                )
+        return expendable
 
     def describe(self) -> dict[str, Any]:
         """Tell what would go now.
@@ -138,8 +140,8 @@ class Retention:
                 if is_gone:
                     gone.append(item)
                     what = {"run_id": item.id} if item.kind in {"attempts", "log"} else {}
-                    told = {"name": item.name, "bytes": item.bytes, "rule": item.rule}
-                    self._note({"what": f"remove {item.kind}", **what, **told})
+                    about = {"name": item.name, "bytes": item.bytes, "rule": item.rule}
+                    self._note({"what": f"remove {item.kind}", **what, **about})
             return gone
 
     def _of_runs(self, now: float) -> Iterator[Expendable]:
@@ -159,10 +161,10 @@ class Retention:
                 if size:
                     rule = "PHYSHANDI_KEEP_ATTEMPTS_DAYS"
                     yield Expendable("attempts", self._named(place), size, days, rule, item.id)
-            told = [path for path in _told_files(run) if path.exists()]
-            if logs is not None and days > logs and told:
-                size, rule = freed_by(told), "PHYSHANDI_KEEP_LOGS_DAYS"
-                yield Expendable("log", self._named(told[0]), size, days, rule, item.id)
+            files = [path for path in _log_files(run) if path.exists()]
+            if logs is not None and days > logs and files:
+                size, rule = freed_by(files), "PHYSHANDI_KEEP_LOGS_DAYS"
+                yield Expendable("log", self._named(files[0]), size, days, rule, item.id)
 
     def _of_cache(self, now: float) -> Iterator[Expendable]:
         days, most = self._settings.keep_cache_days, self._settings.cache_gib
@@ -195,7 +197,7 @@ class Retention:
             except NotFoundError:
                 return False
             return True
-        do = _remove_attempts if item.kind == "attempts" else _remove_told
+        do = _remove_attempts if item.kind == "attempts" else _remove_log_files
         return self._scheduler.do_if_ended(item.id, do)
 
     def _named(self, path: Path) -> str:
@@ -246,11 +248,11 @@ def _remove_attempts(run: Run) -> None:
         run.start_over()
 
 
-def _remove_told(run: Run) -> None:
-    for path in _told_files(run):
+def _remove_log_files(run: Run) -> None:
+    for path in _log_files(run):
         path.unlink(missing_ok=True)
 
 
-def _told_files(run: Run) -> tuple[Path, Path]:
+def _log_files(run: Run) -> tuple[Path, Path]:
     """Name the files that tell how an ended fit went, but for its losses."""
     return run.folder / LOG, run.folder / PREVIEW

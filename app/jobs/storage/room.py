@@ -55,16 +55,16 @@ class Room:
         Raises:
             NoRoomError: If there is none; tells the numbers.
         """
-        needs = f"{what} needs {_told(size)}" if size else f"{what} is not begun"
+        needs = f"{what} needs {_text(size)}" if size else f"{what} is not begun"
         free = _free_at(self._folder)
         if free - size < self._kept_free:
             raise NoRoomError(
-                f"{needs}: the disk has {_told(free)} free, of which {_told(self._kept_free)} are "
+                f"{needs}: the disk has {_text(free)} free, of which {_text(self._kept_free)} are "
                 "kept (PHYSHANDI_KEEP_FREE_GIB). Free some space."
             )
         if self._most is not None and (used := self.size()) + size >= self._most:
             raise NoRoomError(
-                f"{needs}: the data folder has {_told(used)}, of at most {_told(self._most)} "
+                f"{needs}: the data folder has {_text(used)}, of at most {_text(self._most)} "
                 "(PHYSHANDI_DATA_GIB). Delete runs or recordings, or let what is not needed be "
                 "removed (page Recovery)."
             )
@@ -85,7 +85,7 @@ def files_in(folder: Path) -> Iterator[tuple[Path, int]]:
 
     Links lead nowhere, and what vanishes meanwhile is left out.
     """
-    known: set[tuple[int, int]] = set()
+    counted: set[tuple[int, int]] = set()
     for parent, _, names in os.walk(folder):
         for name in names:
             path = Path(parent, name)
@@ -95,9 +95,9 @@ def files_in(folder: Path) -> Iterator[tuple[Path, int]]:
                 continue
             if status.st_nlink > 1:
                 key = (status.st_dev, status.st_ino)
-                if key in known:
+                if key in counted:
                     continue
-                known.add(key)
+                counted.add(key)
             yield path, status.st_size
 
 
@@ -106,5 +106,5 @@ def _free_at(folder: Path) -> int:
     return shutil.disk_usage(existing).free
 
 
-def _told(size: int) -> str:
+def _text(size: int) -> str:
     return f"{size / 2**30:.2f} GiB" if size >= 0.1 * 2**30 else f"{size / 2**20:.1f} MiB"

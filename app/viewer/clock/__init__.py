@@ -1,1 +1,1 @@
-"""Which frame is on the screen."""
+"""The clock of a session: which frame is on the screen."""

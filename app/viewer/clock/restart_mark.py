@@ -1,4 +1,4 @@
-"""Where on the timeline prediction starts from the observed state."""
+"""Mark on the timeline at which prediction starts from the observed state."""
 
 import viser
 
@@ -68,5 +68,5 @@ def mark_html(frame: int, frame_count: int) -> str:
     )
     track = "margin:0.1em 6.6em 0.5em 11.7em"
     style = "font-size:0.7em;line-height:1.4;opacity:0.85;padding-bottom:0.4em"
-    told = f"<div style='text-align:right;padding-right:1.2em'>{restart_told(frame)}</div>"
-    return f"<div style='{style}'><div style='{track}'>{bar}</div>{told}</div>"
+    label = f"<div style='text-align:right;padding-right:1.2em'>{restart_told(frame)}</div>"
+    return f"<div style='{style}'><div style='{track}'>{bar}</div>{label}</div>"

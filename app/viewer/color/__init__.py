@@ -1,1 +1,1 @@
-"""What a color means: quantities, color scales and their legend."""
+"""Coloring: quantities, color scales and their legend."""

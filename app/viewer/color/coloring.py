@@ -46,12 +46,12 @@ class ObservedError:
         self._content = content
         tracks, fitted = content.tracks, content.fitted
         self._tracks = tracks
-        self._known: Int[ndarray, " known"] = np.zeros(0, np.int64)
+        self._compared: Int[ndarray, " compared"] = np.zeros(0, np.int64)
         if tracks is None or fitted is None:
             return
-        self._known = np.flatnonzero(tracks.is_visible[0])
+        self._compared = np.flatnonzero(tracks.is_visible[0])
         start = np.asarray(fitted.position[0], dtype=np.float64)
-        place = np.asarray(tracks.point[0, self._known], dtype=np.float64)
+        place = np.asarray(tracks.point[0, self._compared], dtype=np.float64)
         if len(place) == 0:
             self._tracks = None
             return
@@ -68,7 +68,7 @@ class ObservedError:
 
     @property
     def source(self) -> str:
-        """What it is a distance from."""
+        """Reference of the distance."""
         if self._tracks is None:
             return "the nearest observed point"
         return self._tracks.name
@@ -87,18 +87,18 @@ class ObservedError:
 
     def tracks(
         self, rollout: ObjectRollout, frame: int
-    ) -> tuple[Float[ndarray, " known"], Bool[ndarray, " known"]]:
+    ) -> tuple[Float[ndarray, " compared"], Bool[ndarray, " compared"]]:
         """Measure the error of each track that frame 0 shows [m], and tell whether it is seen."""
-        tracks, known = self._tracks, self._known
+        tracks, compared = self._tracks, self._compared
         if tracks is None or frame >= len(tracks.point):
-            return np.full(len(known), np.nan), np.zeros(len(known), dtype=bool)
-        point = np.asarray(tracks.point[frame, known], dtype=np.float64)
-        is_seen = np.asarray(tracks.is_visible[frame, known]) & np.isfinite(point).all(axis=1)
+            return np.full(len(compared), np.nan), np.zeros(len(compared), dtype=bool)
+        point = np.asarray(tracks.point[frame, compared], dtype=np.float64)
+        is_seen = np.asarray(tracks.is_visible[frame, compared]) & np.isfinite(point).all(axis=1)
         if tracks.node is not None:
-            predicted = np.asarray(rollout.position[frame], dtype=np.float64)[tracks.node[known]]
+            predicted = np.asarray(rollout.position[frame], dtype=np.float64)[tracks.node[compared]]
         else:
             both = np.stack([rollout.position[0], rollout.position[frame]]).astype(np.float64)
-            start = np.asarray(tracks.point[0, known], dtype=np.float64)
+            start = np.asarray(tracks.point[0, compared], dtype=np.float64)
             predicted = carried_points(start, both)[1]
         return np.linalg.norm(point - predicted, axis=1), is_seen
 
@@ -139,7 +139,7 @@ class Painted:
     values: Values
     """The quantity at nodes and springs."""
     scale: ColorScale
-    """Which color means which value."""
+    """The color scale."""
 
     @property
     def node(self) -> UInt8[ndarray, "node 3"]:
@@ -179,7 +179,7 @@ class Painter:
         self._content_mass = content.mass
         self._node_count = 1 if content.fitted is None else content.fitted.model.node_count
         self.mass: ObjectMass | None = content.mass
-        """What the object weighs; None if nobody knows."""
+        """Mass of the object; None if unknown."""
         self._ranges: dict[
             tuple[Coloring, _Parts], tuple[ObjectRollout, ObjectRollout | None, int, Limits]
         ] = {}
@@ -192,7 +192,7 @@ class Painter:
 
     @property
     def offered(self) -> tuple[Coloring, ...]:
-        """What can be told of the content's object; nothing without one."""
+        """Colorings of the content's object; none without one."""
         if not self._has_object:
             return ()
         return tuple(c for c in COLORINGS[1:] if c != "error" or self.errors.is_known)
@@ -215,7 +215,7 @@ class Painter:
 
     @property
     def kilograms(self) -> float:
-        """What the object weighs as forces are written [kg]: as its model if nobody knows."""
+        """Mass for which forces are written [kg]: that of the model if the object's is unknown."""
         return float(self._node_count) if self.mass is None else self.mass.kilograms
 
     @property
@@ -264,16 +264,16 @@ class Painter:
         """
         layers = layers or Layers()
         key = coloring, _shown_parts(layers)
-        known = self._ranges.get(key)
-        if known is not None and known[0] is rollout and known[1] is self.reference:
-            is_enough = rollout.ready == known[2] or (
-                not rollout.is_complete and rollout.ready < 2 * known[2]
+        cached = self._ranges.get(key)
+        if cached is not None and cached[0] is rollout and cached[1] is self.reference:
+            is_enough = rollout.ready == cached[2] or (
+                not rollout.is_complete and rollout.ready < 2 * cached[2]
             )
             if is_enough:
-                return known[3]
-        found = self._measure_range(coloring, rollout, layers)
-        self._ranges[key] = (rollout, self.reference, rollout.ready, found)
-        return found
+                return cached[3]
+        limits = self._measure_range(coloring, rollout, layers)
+        self._ranges[key] = (rollout, self.reference, rollout.ready, limits)
+        return limits
 
     def _measure_range(self, coloring: Coloring, rollout: ObjectRollout, layers: Layers) -> Limits:
         quantity = self.quantity(coloring)

@@ -1,4 +1,4 @@
-"""How far apart two rollouts are: node by node if they are of one object, else to the surface.
+"""Distance between two rollouts: node by node if they are of one object, else to the surface.
 
 The one place where this is computed. The comparison of two runs uses it, and so does the color
 "difference" of a re-simulated object: ``take_difference(rollout, frame, fitted, frame)``.
@@ -26,7 +26,7 @@ _SAME_NODE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class FrameDifference:
-    """How far apart two rollouts are in one frame, over the nodes that were compared."""
+    """Distance between two rollouts in one frame, over the nodes that were compared."""
 
     mean: float
     """Mean distance [m]."""

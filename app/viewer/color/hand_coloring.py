@@ -42,7 +42,7 @@ class HandPainter:
 
     @property
     def offered(self) -> tuple[Coloring, ...]:
-        """What can be told; nothing where there is no hand with a surface."""
+        """Available colorings; none where there is no hand with a surface."""
         if not any(hand.face is not None for hand in self._hands):
             return ()
         is_known = any(self._error(hand) is not None for hand in self._hands)
@@ -107,8 +107,8 @@ class HandPainter:
             frames = np.unique(np.linspace(0, last, _SAMPLED_FRAMES).astype(int))
             parts = [self.measure(coloring, hand, int(f)) for hand in self._hands for f in frames]
             value = np.concatenate(parts)
-            found = nearly_all(value[np.isfinite(value)], self.quantity(coloring))
-            self._ranges[coloring] = found if found is not None and found[1] > 0 else (0.0, 1.0)
+            limits = nearly_all(value[np.isfinite(value)], self.quantity(coloring))
+            self._ranges[coloring] = limits if limits is not None and limits[1] > 0 else (0.0, 1.0)
         return self._ranges[coloring]
 
 

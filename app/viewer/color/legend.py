@@ -31,7 +31,7 @@ Limits = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class ColorScale:
-    """Which color means which value of a quantity."""
+    """Color scale of a quantity."""
 
     quantity: Quantity
     """The quantity, in the units of the content."""
@@ -79,7 +79,7 @@ class Legend:
     """Legend of the current coloring: its scale, and what the frame on the screen has of it."""
 
     scale: ColorScale
-    """Which color means which value."""
+    """The color scale."""
     unknown: int = 0
     """Items without a value in this frame."""
     is_known: bool = True
@@ -87,7 +87,7 @@ class Legend:
     highest: float | None = None
     """Highest value in this frame, in SI units; None if it is not written."""
     item: str = "node"
-    """What has the values: ``node`` or ``vertex``."""
+    """Item that has the values: ``node`` or ``vertex``."""
     shown: Float[ndarray, " value"] = field(default_factory=lambda: np.zeros(0))
     """Known values of all that is shown in this frame, in SI units."""
 
@@ -108,19 +108,19 @@ class Legend:
             shown: Known values of all that is shown.
             item: What has the values: ``node`` or ``vertex``.
         """
-        known = value[np.isfinite(value)]
+        finite = value[np.isfinite(value)]
         return cls(
             scale=scale,
-            unknown=len(value) - len(known),
-            is_known=bool(len(known)),
-            highest=float(known.max(initial=0.0)),
+            unknown=len(value) - len(finite),
+            is_known=bool(len(finite)),
+            highest=float(finite.max(initial=0.0)),
             item=item,
             shown=shown,
         )
 
     @property
     def shares(self) -> list[float]:
-        """How many values have each color, as shares of the most frequent one; empty without any.
+        """Histogram of the values by color, as shares of its highest bar; empty without values.
 
         From the low to the high end of the scale, where what lies beyond is counted, too.
         """
@@ -132,8 +132,8 @@ class Legend:
     def frame_limits(self) -> Limits | None:
         """Range that nearly all values of this frame lie in; None if there are none."""
         quantity = self.scale.quantity
-        found = nearly_all(self.shown, quantity)
-        return None if found is None else with_width(found, quantity)
+        limits = nearly_all(self.shown, quantity)
+        return None if limits is None else with_width(limits, quantity)
 
 
 def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Limits | None:

@@ -27,18 +27,18 @@ class Values:
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """How a quantity is measured and written."""
+    """A quantity, its unit and its color scale."""
 
     label: str
     """Its name."""
     about: str
-    """What it is at nodes and springs, in a sentence."""
+    """Its definition at nodes and springs, in a sentence."""
     unit: str
     """Unit in which it is written, ``mm`` if it is a length."""
     factor: float = 1.0
     """Written value of one SI unit."""
     scale: Scale = "sequential"
-    """Which colors."""
+    """Its color map."""
     is_logarithmic: bool = False
     """Whether equal ratios are equal steps of color."""
     is_static: bool = False

@@ -1,4 +1,4 @@
-"""Where the cameras stand while two sides are shown beside each other, and how they come back."""
+"""Cameras while two sides are shown beside each other, and their way back."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -143,13 +143,13 @@ def picture_of_both(client: viser.ClientHandle, box: Box) -> dict[str, Any]:
     eye = Eye.of(camera.wxyz)
     aside = 0.5 * hidden * pixel * distance * eye.right
     reach = abs(float((box[0] - camera.look_at) @ eye.up)) + 0.5 * box[2]
-    kept = min(2 * reach / (pixel * distance), height)
+    shown_height = min(2 * reach / (pixel * distance), height)
     return {
         "width": PICTURE_WIDTH,
-        "height": max(round(kept * PICTURE_WIDTH / (width - hidden)), 1),
+        "height": max(round(shown_height * PICTURE_WIDTH / (width - hidden)), 1),
         "wxyz": camera.wxyz,
         "position": camera.position - aside,
-        "fov": 2 * float(np.arctan(np.tan(camera.fov / 2) * kept / height)),
+        "fov": 2 * float(np.arctan(np.tan(camera.fov / 2) * shown_height / height)),
     }
 
 

@@ -20,7 +20,7 @@ _REFRESH = 0.25
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pairing:
-    """Which rollouts are compared, and which of their frames belong together."""
+    """The two rollouts that are compared, and pairs of corresponding frames."""
 
     first: ObjectRollout
     """Rollout of A."""
@@ -49,7 +49,7 @@ class DifferenceCurve:
 
     @property
     def way(self) -> Way | None:
-        """How the rollouts are compared; None without a pair."""
+        """Method of the comparison; None without a pair."""
         with self._condition:
             return self._way
 

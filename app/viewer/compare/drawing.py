@@ -104,17 +104,17 @@ _HAND_OPACITY = 0.35
 _OVERLAY_OPACITY = 0.7
 _SAME_HAND = 1e-5
 _LIGHTNESS = np.array([0.299, 0.587, 0.114])
-"""How much red, green and blue contribute to how light a color is."""
+"""Weights of red, green and blue in the lightness of a color."""
 
 
 @dataclass(kw_only=True)
 class Look:
-    """How A and B are shown together: what the panel of the comparison chooses."""
+    """Display of A and B together, as the panel of the comparison chooses it."""
 
     mode: Mode = "side"
-    """How both are placed."""
+    """Arrangement of both."""
     tint: Tint = "side"
-    """What the colors of the nodes mean."""
+    """Meaning of the nodes' colors."""
     fade: float = 0.5
     """In an overlay: 0 shows A alone, 1 shows B alone, 0.5 shows both."""
     wipe: float = 0.5

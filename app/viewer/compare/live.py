@@ -30,7 +30,7 @@ _THIS, _FIT = "this rollout", "the fit"
 _LONGEST_TEXT = 70
 
 Compared = Literal["kept", "phystwin"]
-"""What the rollout of the sliders is compared with: A that was kept, or B held as by PhysTwin."""
+"""Counterpart of the sliders' rollout: A that was kept, or B held as by PhysTwin."""
 
 
 class LiveComparison:
@@ -74,8 +74,8 @@ class LiveComparison:
         self._view: CompareView | None = None
         self._compared: Compared = "kept"
         self._look_of_kept = Look(mode="overlay")
-        self._kept: ObjectRollout | None = None
-        self._last_kept: ObjectRollout | None = None
+        self._rollout_a: ObjectRollout | None = None
+        self._last_rollout_a: ObjectRollout | None = None
         self._baseline: PhysTwinBaseline | None = None
         self._phystwin: LiveRollouts | None = None
         self._described: tuple[Any, ...] = ()
@@ -127,7 +127,7 @@ class LiveComparison:
         self.close()
         with self._lock:
             self._content, self._framing = content, framing
-            self._kept = self._last_kept = None
+            self._rollout_a = self._last_rollout_a = None
             self._run = run if run is not None and PhysTwinBaseline.is_offered(content) else None
             self._keep_buttons.visible = content.fitted is not None
             self._figure_button.visible = self.offers_figure
@@ -145,7 +145,7 @@ class LiveComparison:
             elif self._keep_buttons.visible and self._content is not None:
                 newest = self._newest()
                 now = newest.parameters if newest is not None else None
-                others = (self._last_kept, self._content.fitted)
+                others = (self._last_rollout_a, self._content.fitted)
                 other = next((o for o in others if o is not None and o.parameters != now), None)
                 if other is None:
                     raise UsageError(
@@ -166,7 +166,7 @@ class LiveComparison:
         with self._lock:
             fitted = self._content.fitted if self._content is not None else None
             self._enter("kept", fitted if is_fit else self._newest())
-            self._last_kept = self._kept
+            self._last_rollout_a = self._rollout_a
         self._redraw()
 
     def toggle_figure(self) -> None:
@@ -251,7 +251,7 @@ class LiveComparison:
             return self._cameras.forget(client)
 
     def pose(self) -> Pose | None:
-        """Where the first client's camera stands in the scene; None without clients."""
+        """Pose of the first client's camera in the scene; None without clients."""
         clients = list(self._server.get_clients().values())
         return self._cameras.before(clients[0]) if clients else None
 
@@ -280,14 +280,14 @@ class LiveComparison:
             view.panel.next_tint(step)
         return view is not None
 
-    def _enter(self, compared: Compared, kept: ObjectRollout | None) -> None:
+    def _enter(self, compared: Compared, rollout_a: ObjectRollout | None) -> None:
         content, framing = self._content, self._framing
         if content is None or framing is None or content.fitted is None:
             raise MissingInputError("There is no simulated object here to compare.")
         if compared == "kept":
-            if kept is None or kept.ready == 0:
+            if rollout_a is None or rollout_a.ready == 0:
                 raise MissingInputError("There is no simulated frame to keep yet.")
-            self._kept = kept
+            self._rollout_a = rollout_a
         if self._view is not None and self._compared == compared:
             return
         self._leave()
@@ -324,7 +324,9 @@ class LiveComparison:
     def _sides(self, rollout: ObjectRollout, rollout_frame: int, frame: int) -> Sides:
         """Collect what A and B show."""
         shown, is_figure = self._shown_side(rollout, rollout_frame, frame), self.is_figure
-        other = self._phystwin.newest if is_figure and self._phystwin is not None else self._kept
+        other = (
+            self._phystwin.newest if is_figure and self._phystwin is not None else self._rollout_a
+        )
         title, detail = ("PhysTwin-style", "simulating …") if is_figure else ("A · kept", "")
         if other is not None and other.ready > 0:
             detail = self._topology(other) if is_figure else self._changes(other)
@@ -358,8 +360,8 @@ class LiveComparison:
 
     def _describe(self, view: CompareView, newest: ObjectRollout) -> None:
         """Name both sides on the panel and measure their difference, as far as that is new."""
-        kept, content = self._kept, self._content
-        first, second = (newest, None) if self.is_figure else (kept, newest)
+        rollout_a, content = self._rollout_a, self._content
+        first, second = (newest, None) if self.is_figure else (rollout_a, newest)
         if self.is_figure and self._phystwin is not None:
             second = self._phystwin.newest
         if first is None or second is None or content is None:
@@ -383,13 +385,13 @@ class LiveComparison:
         frames = tuple((frame, frame) for frame in range(count))
         view.follow(Pairing(first=first, second=second, frames=frames))
 
-    def _changes_from(self, kept: ObjectRollout, newest: ObjectRollout) -> tuple[str, ...]:
+    def _changes_from(self, rollout_a: ObjectRollout, newest: ObjectRollout) -> tuple[str, ...]:
         """Say how the parameters of B differ from those of A."""
         unit = self._content.length_unit if self._content is not None else "m"
-        sliders = knobs(kept.parameters, length_unit=unit)
-        changes = changes_in(sliders, kept.parameters, newest.parameters)
+        sliders = knobs(rollout_a.parameters, length_unit=unit)
+        changes = changes_in(sliders, rollout_a.parameters, newest.parameters)
         texts = [change.text for change in changes]
-        texts += edits_text(kept.edits, newest.edits)
+        texts += edits_text(rollout_a.edits, newest.edits)
         if texts:
             return (f"From A to B: {', '.join(texts)}",)
         return ("From A to B: equal parameters. Move a slider to change B.",)

@@ -1,4 +1,4 @@
-"""Which two runs are compared, and what has to be said of the pair."""
+"""The two runs of a comparison, and notes about the pair."""
 
 import math
 from dataclasses import dataclass
@@ -76,11 +76,11 @@ class Pair:
     """Two runs that are shown together."""
 
     contents: tuple[Content, Content]
-    """What A and B show."""
+    """Contents of A and B."""
     clock: CompareClock
     """The time that both share."""
     notes: tuple[str, ...]
-    """What a user should know before believing what is seen."""
+    """Warnings about the comparison."""
     can_measure: bool
     """Whether the difference means something."""
 
@@ -147,8 +147,8 @@ def chosen_sequences(first: Run, second: Run, wanted: str | None) -> tuple[str, 
     """
     shared = [name for name in first.sequence_names if name in second.sequence_names]
     if wanted is not None and wanted not in shared:
-        told = ", ".join(shared) or "none"
-        raise UsageError(f"sequence: '{wanted[:80]}' is not in both runs. In both: {told}.")
+        names = ", ".join(shared) or "none"
+        raise UsageError(f"sequence: '{wanted[:80]}' is not in both runs. In both: {names}.")
     if wanted is not None or shared:
         name = wanted or next((n for n in shared if _has(first, n) and _has(second, n)), shared[0])
         return name, name

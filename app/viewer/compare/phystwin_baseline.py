@@ -19,16 +19,16 @@ PROFILE = "phystwin"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhysTwinBaseline:
-    """What the comparison with PhysTwin simulates: the run's object, held in PhysTwin's way."""
+    """Baseline of the comparison with PhysTwin: the run's object, held in PhysTwin's way."""
 
     controls: Int[ndarray, " chosen"]
-    """Which of the run's control nodes hold the object."""
+    """Numbers of the run's control nodes that hold the object."""
     parameters: SimulationParameters
     """The fitted parameters with PhysTwin's virtual springs."""
     source: str
-    """Where the control nodes come from, in a few words."""
+    """Source of the control nodes, in a few words."""
     note: str = ""
-    """What is not as in PhysTwin, or why there is little to compare; empty if all is."""
+    """Differences from PhysTwin, or why there is little to compare; empty if there are none."""
 
     @staticmethod
     def is_offered(content: Content) -> bool:
@@ -96,10 +96,10 @@ def _candidates(
             vertex = control[offset : offset + hand.vertex.shape[1]]
             seen.append(visible_vertices(content.views, vertex, hand.face) + offset)
         offset += hand.vertex.shape[1]
-    found = np.concatenate(seen)
-    if len(found) == 0:
+    visible = np.concatenate(seen)
+    if len(visible) == 0:
         return everything, "hand vertices", "No camera sees a hand vertex at frame 0."
-    return found, "visible hand points", ""
+    return visible, "visible hand points", ""
 
 
 def _hands_in_order(

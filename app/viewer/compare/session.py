@@ -29,7 +29,7 @@ from app.viewer.ui.tabs import Tabs
 
 
 class CompareSession(SceneServer):
-    """What one browser tab looks at: two runs in one viser server, with one panel and clock."""
+    """Live scene that compares two runs, in one viser server with one panel and clock."""
 
     kind: Kind = "comparison"
 
@@ -80,7 +80,7 @@ class CompareSession(SceneServer):
 
     @property
     def state(self) -> SessionState:
-        """What the user has set up besides `target`, for a copy of this session."""
+        """Settings of the user besides `target`, for a copy of this session."""
         theme, prefers_dark = self._layers_panel.theme
         clients = list(self._server.get_clients().values())
         return SessionState(

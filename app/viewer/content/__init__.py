@@ -1,1 +1,1 @@
-"""What there is to show: a recording, a run, its rollouts and the state of a session."""
+"""Contents of scenes: a recording, a run, its rollouts and the state of a session."""

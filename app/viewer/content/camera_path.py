@@ -19,7 +19,7 @@ from physhandi.errors import UsageError
 PATH_FORMAT = "physhandi-camera-path/1"
 MOST_KEYS = 1_000
 _STEEPEST = 3.0
-"""How much faster than on either side of a key frame the camera may pass it: more overshoots."""
+"""Largest ratio of the camera's speed at a key frame to that on either side: more overshoots."""
 _FIELDS = {"frame", "position", "look_at", "up", "fov"}
 _SAME = 1e-9
 
@@ -151,7 +151,7 @@ class CameraPath:
 
 
 CameraMotion = CameraPath | Turntable
-"""How the camera of a film moves."""
+"""Motion of a film's camera."""
 
 
 def read_camera_path(path: Path) -> CameraMotion:
@@ -183,9 +183,9 @@ def parse_camera_path(text: str) -> CameraMotion:
     if content is None or content.get("format") != PATH_FORMAT:
         raise UsageError(f'format: a camera path begins with {{"format": "{PATH_FORMAT}", …}}.')
     kind = content.get("kind")
-    known = {"format", "kind", "turn" if kind == "turntable" else "keys"}
+    fields = {"format", "kind", "turn" if kind == "turntable" else "keys"}
     for name in content:
-        if kind in {"keys", "turntable"} and name not in known:
+        if kind in {"keys", "turntable"} and name not in fields:
             raise UsageError(f"{name[:40]}: a camera path of kind '{kind}' has no such field.")
     if kind == "turntable":
         return Turntable(_number(content.get("turn"), "turn", -3600.0, 3600.0))

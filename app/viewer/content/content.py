@@ -1,4 +1,4 @@
-"""What a session shows: hands, object, observation and cameras of one sequence."""
+"""Content of a session: hands, object, observation and cameras of one sequence."""
 
 import logging
 from collections.abc import Sequence as Listing
@@ -58,7 +58,7 @@ class ShownHand:
     joint: Float[ndarray, "frame joint 3"] | None = None
     """Its 21 joints [m], if the run holds them."""
     keypoint: Float[ndarray, "view frame joint 3"] | None = None
-    """Where the views saw the joints (x, y [px], confidence), NaN where they did not."""
+    """Keypoints of the joints in the views (x, y [px], confidence), NaN where not seen."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,7 +96,7 @@ class Content:
     views: Listing[View] = field(default_factory=tuple)
     """The recording's views."""
     mass: ObjectMass | None = None
-    """What the object weighs; None if it can not even be estimated."""
+    """Mass of the object; None if it can not even be estimated."""
     surface: ObjectSurface | None = None
     """The smooth surface of the object; None if its nodes have none."""
     splats: Splats | None = None

@@ -1,4 +1,4 @@
-"""Which parts of a scene are shown, and in which colors."""
+"""Shown parts of a scene, and their colors."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -16,7 +16,7 @@ PURPLE = (125, 65, 195)
 SKIN = {"right": (224, 172, 140), "left": (205, 150, 122)}
 
 Theme = Literal["as the browser", "light", "dark"]
-"""Which background a user can choose."""
+"""Backgrounds to choose from."""
 THEMES: tuple[Theme, ...] = ("as the browser", "light", "dark")
 
 Coloring = Literal[
@@ -26,7 +26,7 @@ Coloring = Literal[
 COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
 
 ObjectForm = Literal["splats", "surface", "nodes"]
-"""What an object can be shown as."""
+"""Forms in which an object can be drawn."""
 OBJECT_FORMS: tuple[ObjectForm, ...] = get_args(ObjectForm)
 
 PLAYING_SPRINGS = 2_000
@@ -35,7 +35,7 @@ PLAYING_SPRINGS = 2_000
 
 @dataclass
 class Layers:
-    """Which parts of the scene are shown."""
+    """Shown parts of the scene."""
 
     hands: bool = True
     """Hand meshes."""
@@ -73,7 +73,7 @@ class Layers:
     color_range: tuple[float, float] | None = None
     """Values at the ends of the color scale, in SI units; None for those of the sequence."""
     mass: float | None = None
-    """What the object weighs [kg], for which forces are shown; None for what the content says."""
+    """Mass of the object for which forces are shown [kg]; None for that of the content."""
 
 
 def default_layers(content: Content) -> Layers:

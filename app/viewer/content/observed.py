@@ -1,4 +1,4 @@
-"""What was seen: points and clouds of a frame, identified tracks and markers, hand keypoints."""
+"""Observations: points and clouds of a frame, identified tracks and markers, hand keypoints."""
 
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
@@ -68,7 +68,7 @@ class CloudSet:
         self._end = end
         self._views = [view for view in views if view.has_color and view.has_mask]
         self._frame = 0
-        self._known: dict[int, UInt8[ndarray, "*point 3"]] = {}
+        self._colors: dict[int, UInt8[ndarray, "*point 3"]] = {}
 
     def points(self, frame: int) -> Float[ndarray, "point 3"]:
         """Find the cloud of a frame, thinned out [m]."""
@@ -84,11 +84,11 @@ class CloudSet:
         frame = self._frame
         if not self._views or frame >= self._views[0].frame_count:
             return _GREEN
-        if frame not in self._known:
-            if len(self._known) >= _MOST_FRAMES:
-                self._known.clear()
-            self._known[frame] = self._seen(frame)
-        return self._known[frame]
+        if frame not in self._colors:
+            if len(self._colors) >= _MOST_FRAMES:
+                self._colors.clear()
+            self._colors[frame] = self._seen(frame)
+        return self._colors[frame]
 
     @property
     def is_colored(self) -> bool:
@@ -157,7 +157,7 @@ class Tracks:
 
     @property
     def name(self) -> str:
-        """What they are called: whoever knows their nodes has markers."""
+        """Their name: points with known nodes are markers."""
         return "the tracks" if self.node is None else "the markers"
 
 
@@ -166,7 +166,7 @@ class Markers:
     """Markers that keep their number over the frames."""
 
     point: Float[ndarray, "frame marker 3"]
-    """Where they are [m]; NaN where they are not seen."""
+    """Positions [m]; NaN where they are not seen."""
     held: tuple[int, ...]
     """Those that sit on what moves the object, and are control points therefore."""
     links: Int[ndarray, "link 2"]

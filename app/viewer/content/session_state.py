@@ -30,13 +30,13 @@ class SessionInfo:
     target: str
     """Id of the run or the sequence; of a comparison the query after ``/compare?``."""
     owner: str
-    """Who opened it."""
+    """Visitor who opened it."""
     title: str
     """Name of what is shown."""
     client_count: int
     """Browsers that look at it."""
     created: float
-    """When it was opened [s since 1970]."""
+    """Time of opening [s since 1970]."""
     idle: float
     """Time since a browser was connected [s]."""
     offers: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class SessionInfo:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
-    """Where a camera stands and what it looks at."""
+    """Pose of a camera: its position and the point that it looks at."""
 
     position: Float[ndarray, " 3"]
     """Of the camera."""
@@ -100,7 +100,7 @@ class Pose:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class KeyFrame:
-    """Where the camera of a film is in one frame."""
+    """Pose of a film's camera in one frame."""
 
     frame: int
     """The frame."""
@@ -123,13 +123,13 @@ class SessionState:
     does_loop: bool
     """Whether playing starts over at the end."""
     layers: Layers | None
-    """What is shown; None for what suits the content."""
+    """Shown layers; None for the content's default."""
     theme: Theme
-    """Which background was chosen."""
+    """Chosen background."""
     prefers_dark: bool
     """Whether the browser asks for a dark one."""
     parameters: SimulationParameters | None
-    """What the object was simulated with last; None without an object."""
+    """Parameters of the last simulation; None without an object."""
     automatic_substeps: bool
     """Whether the number of substeps is chosen automatically."""
     is_figure: bool
@@ -146,7 +146,7 @@ class SessionState:
     camera_keys: tuple[KeyFrame, ...] = ()
     """Key frames of the path that the camera of a film follows; see `CameraPath`."""
     edits: Edits | None = None
-    """What is done to single springs and nodes; None for the object's own edits."""
+    """Edits of single springs and nodes; None for the object's own edits."""
 
     @property
     def is_changed(self) -> bool:

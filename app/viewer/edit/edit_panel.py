@@ -64,7 +64,7 @@ _STIFFNESS, _DAMPING = "Stiffness", "Damping"
 _CUT, _JOIN = "Cut", "Join"
 _PIN, _ATTACH, _RELEASE = "Pin", "Attach", "Release"
 _PART_OF_SURFACE = 0.25
-"""How far behind the surface nodes still belong to it, in distances of nodes."""
+"""Depth behind the surface to which nodes still belong to it, in distances of nodes."""
 _FACTORS = (0.001, 1000.0)
 _MODIFIERS: dict[str | None, SelectWay] = {None: "replace", "shift": "add", "cmd/ctrl": "remove"}
 _STYLE = "font-size:0.85em;line-height:1.5;padding:0.2em 0.9em 0.5em"
@@ -212,7 +212,7 @@ class EditPanel:
 
     @property
     def selection(self) -> Selection:
-        """What is selected."""
+        """The selection."""
         return self._selection
 
     def toggle(self) -> None:
@@ -268,9 +268,9 @@ class EditPanel:
             if is_hidden:
                 self._nodes.hide()
                 return
-            kept = self._selection.within(rollout.model)
-            if kept != self._selection:
-                self._selection = kept
+            present = self._selection.within(rollout.model)
+            if present != self._selection:
+                self._selection = present
                 self._write()
             self._draw(rollout, frame)
 
@@ -321,8 +321,8 @@ class EditPanel:
                 return
             rollout, frame = self._shown()
             cover = self._cover(rollout, frame) if self._only_seen.value else None
-            found = select(eye, shape, rollout, frame, self._kind.value, cover=cover)
-            self._selection = self._selection.changed(found, way)
+            selected = select(eye, shape, rollout, frame, self._kind.value, cover=cover)
+            self._selection = self._selection.changed(selected, way)
         self._show_selection()
 
     def _cover(self, rollout: ObjectRollout, frame: int) -> Cover | None:

@@ -1,4 +1,4 @@
-"""What is selected in a scene: nodes or springs within a shape that somebody drew on the screen."""
+"""Selection in a scene: nodes or springs within a shape that was drawn on the screen."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeVar
@@ -18,9 +18,9 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.typed import decode_json
 
 SelectKind = Literal["nodes", "springs", "virtual springs"]
-"""What a shape selects."""
+"""Kinds of things that a shape selects."""
 SelectWay = Literal["replace", "add", "remove", "toggle"]
-"""What a new selection does to the one before."""
+"""Ways to combine a new selection with the one before."""
 MOST_SHAPE_BYTES = 1 << 18
 """Longer messages of a page are no shapes."""
 _NEAREST = 1e-6
@@ -34,7 +34,7 @@ class ScreenView:
     """A camera, by which the scene is seen on a screen."""
 
     position: Float[ndarray, " 3"]
-    """Where it stands [m]."""
+    """Position of the camera [m]."""
     axes: Float[ndarray, "3 3"]
     """Rows: what is right, down and ahead of it, in the world."""
     fov: float
@@ -71,7 +71,7 @@ class Cover:
     face: Int[ndarray, "face 3"]
     """Its triangles."""
     depth: float
-    """How far behind it things still count as parts of it [m]."""
+    """Depth behind it to which things still count as parts of it [m]."""
 
     def hides(
         self, eye: Float[ndarray, " 3"], point: Float[ndarray, "point 3"]
@@ -164,8 +164,8 @@ class Selection:
             (len(self.springs), "spring"),
             (len(self.virtual), "virtual spring"),
         )
-        told = [f"{count} {name}{'' if count == 1 else 's'}" for count, name in counts if count]
-        return ", ".join(told) or "nothing"
+        parts = [f"{count} {name}{'' if count == 1 else 's'}" for count, name in counts if count]
+        return ", ".join(parts) or "nothing"
 
 
 def of_springs(model: SpringMassModel, chosen: Int[ndarray, " spring"]) -> Selection:
@@ -269,7 +269,7 @@ class Stroke:
     """The way of a brush over the screen."""
 
     points: Float[ndarray, "point 2"]
-    """Where it was, as `ScreenView.project` has it."""
+    """Its positions, as `ScreenView.project` gives them."""
     radius: float
     """Its radius, as a part of the screen's height."""
 
@@ -291,16 +291,16 @@ _Coordinate = Annotated[float, Meta(ge=-10.0, le=10.0)]
 
 
 class DrawnShape(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a page tells of a lasso or a brush when the pointer goes up."""
+    """A finished lasso or brush stroke, as the page reports it."""
 
     tool: Literal["lasso", "brush"]
-    """Which of them."""
+    """The tool."""
     way: SelectWay
-    """What becomes of the selection before."""
+    """How it is combined with the selection before."""
     points: Annotated[
         tuple[tuple[_Coordinate, _Coordinate], ...], Meta(min_length=1, max_length=4000)
     ]
-    """Where the pointer was, as `ScreenView.project` has it."""
+    """Positions of the pointer, as `ScreenView.project` gives them."""
     radius: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """Of the brush, as a part of the screen's height."""
 
@@ -329,24 +329,24 @@ class DrawnShape(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 @dataclass(eq=False)
 class Highlights:
-    """Which points and springs of a model are selected; found out once for a selection."""
+    """Selected points and springs of a model, computed once for a selection."""
 
-    _known: tuple[SpringMassModel, Selection, ndarray, ndarray] | None = field(default=None)
+    _cached: tuple[SpringMassModel, Selection, ndarray, ndarray] | None = field(default=None)
 
     def of(
         self, model: SpringMassModel, selection: Selection
     ) -> tuple[Int[ndarray, " node"], Int[ndarray, " spring"]]:
         """Give the selected nodes, and the places of the selected springs in the model's list."""
-        known = self._known
-        if known is None or known[0] is not model or known[1] is not selection:
+        cached = self._cached
+        if cached is None or cached[0] is not model or cached[1] is not selection:
             nodes = np.array(sorted(selection.nodes), np.int64)
             count = model.node_count + model.control_count
             named = [a * count + b for a, b in selection.springs]
             named += [a * count + b + model.node_count for a, b in selection.virtual]
             ends = np.sort(model.spring_nodes.astype(np.int64), axis=1)
             springs = np.flatnonzero(np.isin(ends[:, 0] * count + ends[:, 1], named))
-            known = self._known = (model, selection, nodes, springs)
-        return known[2], known[3]
+            cached = self._cached = (model, selection, nodes, springs)
+        return cached[2], cached[3]
 
 
 def _changed(was: frozenset[_Item], new: frozenset[_Item], way: SelectWay) -> frozenset[_Item]:

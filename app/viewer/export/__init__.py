@@ -1,1 +1,1 @@
-"""What leaves from the screen: pictures, geometry, tables and bundles."""
+"""Exports of what is on the screen: pictures, geometry, tables and bundles."""

@@ -37,7 +37,7 @@ class Screenshot:
     content: bytes
     """The PNG file."""
     pose: Pose
-    """Where the camera stood."""
+    """Pose of the camera."""
     width: int
     """Width [px]."""
     height: int

@@ -1,4 +1,4 @@
-"""What is on the screen now, for everything that saves it."""
+"""Snapshot of what is on the screen, for everything that saves it."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -31,10 +31,10 @@ _COMPARISON_COLUMNS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Snapshot:
-    """What is on the screen now."""
+    """State of the screen at one moment."""
 
     content: Content
-    """What is shown."""
+    """Content of the scene."""
     frame: int
     """The frame."""
     rollout: ObjectRollout | None
@@ -48,13 +48,13 @@ class Snapshot:
     run: Run | None = None
     """The run, if it is one that is shown."""
     layers: Layers | None = None
-    """Which layers are shown, if that is to be told."""
+    """Shown layers, if they are to be saved."""
     link: str = ""
     """Address on this server that shows the same; empty if there is none."""
 
     @property
     def mass(self) -> ObjectMass | None:
-        """What the object weighs on the screen; None if nobody knows."""
+        """Mass of the object as shown; None if unknown."""
         given = None if self.layers is None else self.layers.mass
         return self.content.mass if given is None else given_mass(given)
 
@@ -170,7 +170,7 @@ def snapshot_csv(snapshot: Snapshot) -> bytes:
     """
     if snapshot.compared is not None:
         sides = snapshot.compared.items()
-        rows = (row for name, (take, frame) in sides for row in _side_rows(name, take, frame))
+        rows = (row for name, (rollout, frame) in sides for row in _side_rows(name, rollout, frame))
         return csv_bytes(_COMPARISON_COLUMNS, rows)
     rollout = _rollout(snapshot)
     return csv_bytes(_MEAN_COLUMNS, (_mean_row(rollout, frame) for frame in range(rollout.ready)))

@@ -1,1 +1,1 @@
-"""What was clicked, and its values."""
+"""Inspection of clicked things and their values."""

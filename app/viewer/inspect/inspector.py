@@ -33,14 +33,14 @@ _NONE = '<div style="font-size:0.8em;padding:0 0.9em 0.4em;opacity:0.8">Click {}
 def clickable(content: Content) -> str:
     """Name what can be clicked in a content; empty if there is nothing."""
     has_object = content.fitted is not None
-    found = ["a node", "a spring"] if has_object else []
+    things = ["a node", "a spring"] if has_object else []
     if not has_object and content.control is not None:
-        found.append("a control point" if content.markers is None else "a gripper")
+        things.append("a control point" if content.markers is None else "a gripper")
     if content.markers is not None:
-        found.append("a marker")
+        things.append("a marker")
     if content.hands:
-        found.append("the hand")
-    return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)
+        things.append("the hand")
+    return " or ".join([", ".join(things[:-1]), things[-1]] if len(things) > 1 else things)
 
 
 TakeClick = Callable[[viser.SceneClickEvent, int | None, int | None], None]
@@ -103,7 +103,7 @@ class Inspector:
 
     @property
     def pick(self) -> Pick | None:
-        """What was clicked."""
+        """The clicked thing."""
         return self._pick
 
     def replace(self, content: Content, scene: SceneDrawing, framing: Framing) -> None:
@@ -148,13 +148,13 @@ class Inspector:
             self._shown, self._grab = (rollout, 0, rollout_frame), grab
             self._dots = dots, choose_dot
 
-    def look_at(self, found: Pick | None) -> None:
+    def look_at(self, thing: Pick | None) -> None:
         """Read a thing, or nothing."""
         with self._lock:
-            if found is None or self._readings is None:
+            if thing is None or self._readings is None:
                 self.clear()
                 return
-            self._pick = self._readings.settle(found)
+            self._pick = self._readings.settle(thing)
             options = HISTORIES[self._pick.kind]
             color = self._scene.layers.color if self._scene is not None else "plain"
             before = self._kind.value
@@ -234,17 +234,17 @@ class Inspector:
                 layers=scene.layers,
                 spacing=framing.spacing,
             )
-            found = pick(ray, target, prefers_hand=prefers_hand)
+            thing = pick(ray, target, prefers_hand=prefers_hand)
         if take is not None:
-            numbers = {} if found is None else {found.kind: found.index}
+            numbers = {} if thing is None else {thing.kind: thing.index}
             take(event, numbers.get("node"), numbers.get("spring"))
-        elif found is not None and grab is not None and rollout is not None:
-            if found.kind == "node":
-                grab(found.index)
-            elif found.kind == "spring":  # An end that is a control node has the higher number.
-                grab(int(rollout.model.spring_nodes[found.index].min()))
-        elif found is not None:
-            self.look_at(found)
+        elif thing is not None and grab is not None and rollout is not None:
+            if thing.kind == "node":
+                grab(thing.index)
+            elif thing.kind == "spring":  # An end that is a control node has the higher number.
+                grab(int(rollout.model.spring_nodes[thing.index].min()))
+        elif thing is not None:
+            self.look_at(thing)
             self._open_tab()
 
     def _mark(

@@ -1,4 +1,4 @@
-"""What lies under a click: nodes, springs, control nodes or the hand, as they are drawn."""
+"""Picking: nodes, springs, control nodes or the hand under a click, as they are drawn."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -26,17 +26,17 @@ class Pick:
     """One thing in the scene."""
 
     kind: PickKind
-    """What it is."""
+    """Its kind."""
     index: int
     """Number of the object node, of the spring in the model's order, of the control node, of
     the hand's vertex or of the marker."""
     side: Literal["right", "left"] | None = None
-    """Which hand, for a vertex that is no control node."""
+    """Side of the hand, for a vertex that is no control node."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ray:
-    """Where a click points."""
+    """Ray of a click."""
 
     origin: Float[ndarray, " 3"]
     """The eye [m]."""
@@ -62,7 +62,7 @@ class Ray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Target:
-    """What is drawn and can be hit."""
+    """Drawn things that can be hit."""
 
     content: Content
     """Hands and control nodes."""
@@ -73,7 +73,7 @@ class Target:
     rollout_frame: int
     """Frame of the rollout."""
     layers: Layers
-    """Which parts are drawn."""
+    """Drawn layers."""
     spacing: float
     """Typical distance of nodes [m]."""
 
@@ -93,15 +93,15 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
     hand, hand_depth = _pick_hand(ray, content, frame) if layers.hands else (None, np.inf)
     if prefers_hand and hand is not None:
         return hand
-    found = None
+    picked = None
     if target.rollout is not None:
-        found = _pick_object(ray, target, target.rollout)
-        if found is None and (layers.surface or layers.splats):
-            found = _pick_surface(ray, target, target.rollout, within=hand_depth)
+        picked = _pick_object(ray, target, target.rollout)
+        if picked is None and (layers.surface or layers.splats):
+            picked = _pick_surface(ray, target, target.rollout, within=hand_depth)
     elif content.control is not None and layers.controls:
         at = _nearest(ray, np.asarray(content.control[frame]), target.spacing)
-        found = None if at is None else Pick(kind="control", index=at[0])
-    return found or _pick_marker(ray, target) or hand
+        picked = None if at is None else Pick(kind="control", index=at[0])
+    return picked or _pick_marker(ray, target) or hand
 
 
 def pick_dot(ray: Ray, dot: Float[ndarray, "dot 3"]) -> int | None:

@@ -1,4 +1,4 @@
-"""What there is to read of one thing in the scene."""
+"""Readings of one thing in the scene."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from physhandi.simulation.model import SpringMassModel
 HistoryQuantity = Literal[
     "speed", "force", "mean force", "strain", "error", "difference", "height", "length"
 ]
-"""What a chart can show of a thing."""
+"""Quantities that a chart can show of a thing."""
 HISTORIES: dict[PickKind, tuple[HistoryQuantity, ...]] = {
     "node": ("speed", "force", "mean force", "strain", "error", "difference", "height"),
     "spring": ("strain", "force", "mean force", "length"),
@@ -29,7 +29,7 @@ HISTORIES: dict[PickKind, tuple[HistoryQuantity, ...]] = {
     "hand": ("speed", "height"),
     "marker": ("speed", "height"),
 }
-"""What a chart can show of each kind of thing."""
+"""Quantities that a chart can show, by kind of thing."""
 
 
 def follow(
@@ -186,7 +186,7 @@ def _attached_rows(model: SpringMassModel, spring: int) -> "Rows":
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandLoad:
-    """What a hand does to the object in one frame."""
+    """Action of a hand on the object in one frame."""
 
     held: int
     """Object nodes that it holds."""

@@ -31,7 +31,7 @@ from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.edits import Edits, encode_edits, keeps_what_is_joined
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.steering import Take
+from physhandi.simulation.steering import SteeredMotion
 
 logger = logging.getLogger(__name__)
 
@@ -47,25 +47,25 @@ _CRASH_WINDOW = 60.0
 
 @dataclass(frozen=True, kw_only=True)
 class LiveRequest:
-    """What to simulate."""
+    """Request for a rollout."""
 
     run: Path
     """Run folder."""
     sequence: str
     """One of the run's sequences."""
     parameters: SimulationParameters
-    """What to simulate it with."""
+    """Parameters of the simulation."""
     automatic_substeps: bool = False
     """Whether to use as few substeps as are stable, instead of the parameters' number."""
     controls: tuple[int, ...] | None = None
-    """Which of the run's control nodes may hold the object; None for all."""
+    """Numbers of the run's control nodes that may hold the object; None for all."""
     edits: Edits = ()
-    """What is done to single springs and nodes."""
+    """Edits of single springs and nodes."""
 
 
 @dataclass(frozen=True)
 class _Unfinished:
-    """What a session asked for and has not got yet."""
+    """Request of a session that is not answered yet."""
 
     message: Message
     has_crashed: bool = False
@@ -170,7 +170,7 @@ class SimulationClient:
     def steer(
         self,
         session: str,
-        take: Take,
+        motion: SteeredMotion,
         limits: HandLimits,
         *,
         replays: bool = False,
@@ -183,9 +183,9 @@ class SimulationClient:
 
         Args:
             session: A session with a listener; what it asked for before is dropped.
-            take: The state to begin in, and the hands; poses after the first are not used.
+            motion: The state to begin in, and the hands; poses after the first are not used.
             limits: What no hand that is steered can do.
-            replays: Whether to simulate the poses of the take instead, and then to end.
+            replays: Whether to simulate the poses of the motion instead, and then to end.
             is_paced: Whether to wait until a frame is due, as far as it is not late.
 
         Returns:
@@ -193,14 +193,14 @@ class SimulationClient:
         """
         fields = {
             "session": session,
-            "parameters": take.parameters.to_dict(),
+            "parameters": motion.parameters.to_dict(),
             "replays": replays,
-            "period": 1.0 / take.parameters.frame_rate if is_paced else 0.0,
+            "period": 1.0 / motion.parameters.frame_rate if is_paced else 0.0,
             "limits": asdict(limits),
         }
         with self._lock:
             number = next(self._numbers)
-            message = Message(STEER, fields | {"request": number}, take.to_tensors())
+            message = Message(STEER, fields | {"request": number}, motion.to_tensors())
             self._unfinished.pop(session, None)
             if self._connection is None:
                 self._unfinished[session] = _Unfinished(message)
@@ -217,8 +217,8 @@ class SimulationClient:
             orders: One a hand.
             most_force: A hand that the object pulls at harder gives way [N]; None for no limit.
         """
-        told = [order.to_dict() for order in orders]
-        fields = {"session": session, "orders": told, "most_force": most_force}
+        described = [order.to_dict() for order in orders]
+        fields = {"session": session, "orders": described, "most_force": most_force}
         with self._lock:
             self._write(Message(DRIVE, fields))
 

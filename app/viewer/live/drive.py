@@ -1,4 +1,4 @@
-"""How a steered hand follows what it is told: smoothly, and within its limits."""
+"""Motion of a steered hand: it follows orders smoothly and within its limits."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.simulation.fingers import Fingers
-from physhandi.simulation.steering import Take, turn_between, turn_on
+from physhandi.simulation.steering import SteeredMotion, turn_between, turn_on
 
 LAG = 0.1
 """Time in which a hand takes up most of a change of its speed [s]."""
@@ -27,16 +27,16 @@ _THERE = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class HandOrder:
-    """Where a hand shall go; the newest order holds until the next."""
+    """Order to a hand; the newest one holds until the next."""
 
     velocity: tuple[float, ...] = (0.0,) * 6
     """Speed of the wrist [m/s] and its turning about the world's axes [rad/s], without a goal."""
     goal: tuple[float, ...] | None = None
     """Place to go to: offset of the wrist [m] and rotation vector [rad]; None to move freely."""
     closing: float = 0.0
-    """How fast the fingers close [1/s]; negative for opening."""
+    """Speed at which the fingers close [1/s]; negative for opening."""
     bend: tuple[float, ...] | None = None
-    """How far each finger shall be bent on top of that [rad], see `Fingers`; None for as it is."""
+    """Target of each finger's bend on top of that [rad], see `Fingers`; None for no change."""
 
     def to_dict(self) -> dict[str, Any]:
         """Describe it in plain data."""
@@ -56,7 +56,7 @@ class HandOrder:
 
 @dataclass(frozen=True, kw_only=True)
 class HandLimits:
-    """What a steered hand cannot do, whatever it is told."""
+    """Limits of a steered hand, which hold for all orders."""
 
     top_speed: float
     """Its wrist moves no faster than this [m/s]."""
@@ -87,11 +87,11 @@ class HandDrive:
             fingers: Its fingers, if they bend one by one.
         """
         self.order = HandOrder()
-        """What the hand follows."""
+        """The order that the hand follows."""
         self.most_force = math.inf
         """Pulled at harder than this, the hand gives way [N]."""
         self.pose = np.array(pose, np.float64)
-        """Where the hand is."""
+        """Pose of the hand."""
         self._step = 1.0 / frame_rate
         self._top = np.array([limits.top_speed, TOP_TURN])
         self._yielding = _YIELDING * limits.top_speed
@@ -193,8 +193,8 @@ class HandDrive:
 class Drives:
     """The hands of one steered object."""
 
-    def __init__(self, take: Take, limits: HandLimits) -> None:
-        """Begin at rest in the first frame of a take; see `HandDrive`.
+    def __init__(self, motion: SteeredMotion, limits: HandLimits) -> None:
+        """Begin at rest in the first frame of a motion; see `HandDrive`.
 
         No control node goes lower than the ground, or than where the lowest one of its hand was
         recorded if that is lower: what is pressed through a table is thrown about.
@@ -202,12 +202,12 @@ class Drives:
         self._drives = [
             HandDrive(
                 pose,
-                frame_rate=take.parameters.frame_rate,
+                frame_rate=motion.parameters.frame_rate,
                 limits=limits,
-                depth=partial(take.depth_below_ground, number),
-                fingers=take.hands[number].fingers,
+                depth=partial(motion.depth_below_ground, number),
+                fingers=motion.hands[number].fingers,
             )
-            for number, pose in enumerate(take.pose[0])
+            for number, pose in enumerate(motion.pose[0])
         ]
 
     def obey(self, orders: Sequence[Mapping[str, Any]], most_force: float | None) -> None:

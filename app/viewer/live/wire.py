@@ -31,7 +31,7 @@ class Message:
     """One message: what it is, plain fields, and arrays."""
 
     kind: str
-    """What the message says, for example ``"frame"``."""
+    """Kind of the message, for example ``"frame"``."""
     fields: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Plain JSON values."""
     arrays: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])

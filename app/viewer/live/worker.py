@@ -26,14 +26,14 @@ from physhandi.simulation.edits import Edits, decode_edits
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps
-from physhandi.simulation.steering import SteeredSimulation, Take
+from physhandi.simulation.steering import SteeredMotion, SteeredSimulation
 from physhandi.simulation.topology import build_model
 
 logger = logging.getLogger(__name__)
 
 
 class Mailbox:
-    """What is to be done next for each session: its newest request, then changes of its pace.
+    """Pending work of each session: its newest request, then changes of its pace.
 
     Of what steers a session's hands only the newest is kept, however often that is told.
     """
@@ -114,7 +114,7 @@ class PacedFrames:
 
     @property
     def due(self) -> float:
-        """When the next frame may be computed [s, clock of `time.monotonic`]."""
+        """Time from which the next frame may be computed [s, clock of `time.monotonic`]."""
         return self._due if self.may_advance else math.inf
 
     def set_pace(self, kind: str) -> None:
@@ -292,13 +292,13 @@ class SimulationWorker:
         send(self._connection, Message("finished", about))
 
     def _steer(self, request: Message, about: dict[str, object]) -> Iterator[int]:
-        """Simulate the frames of a take, or without end what is steered from its first frame on."""
-        take = Take.from_tensors(
+        """Simulate the frames of a motion, or without end what is steered from its start on."""
+        motion = SteeredMotion.from_tensors(
             request.arrays, SimulationParameters.from_dict(request["parameters"])
         )
-        drives = Drives(take, HandLimits(**request["limits"]))
-        steered = SteeredSimulation(take, self._device)
-        state, pose, duration = steered.state, take.pose[0], 0.0
+        drives = Drives(motion, HandLimits(**request["limits"]))
+        steered = SteeredSimulation(motion, self._device)
+        state, pose, duration = steered.state, motion.pose[0], 0.0
         pull = steered.pulls(state)
         while True:
             frame = steered.frame
@@ -307,12 +307,12 @@ class SimulationWorker:
             send(self._connection, Message("frame", fields, arrays))
             yield frame + 1
             if not request["replays"]:
-                told = self._orders.pop(request["session"], None)
-                if told is not None:
-                    drives.obey(told["orders"], told["most_force"])
+                newest = self._orders.pop(request["session"], None)
+                if newest is not None:
+                    drives.obey(newest["orders"], newest["most_force"])
                 pose = drives.next(pull)
-            elif frame + 1 < take.frame_count:
-                pose = take.pose[frame + 1]
+            elif frame + 1 < motion.frame_count:
+                pose = motion.pose[frame + 1]
             else:
                 break
             clock = time.perf_counter()

@@ -1,1 +1,1 @@
-"""What sliders change: parameters, history, presets and the physics panel."""
+"""Control of the simulation: parameters, history, presets and the physics panel."""

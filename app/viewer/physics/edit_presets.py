@@ -24,16 +24,16 @@ _Count = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 
 
 class _Fields(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What files hold of an object or a recording."""
+    """Description of an object or a recording in a file."""
 
 
 class ObjectMark(_Fields, frozen=True, kw_only=True):
-    """What tells whether edits mean the same on another object."""
+    """Identification of an object, which tells whether edits mean the same on another one."""
 
     nodes: _Count
-    """How many object nodes it has."""
+    """Number of its object nodes."""
     springs: _Count
-    """How many object springs it has before all edits."""
+    """Number of its object springs before all edits."""
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     """Hash of the nodes that these springs join; see `ObjectMark.of`."""
 
@@ -48,14 +48,14 @@ class ObjectMark(_Fields, frozen=True, kw_only=True):
 
 
 class RecordingMark(_Fields, frozen=True, kw_only=True):
-    """What tells whether places, frames and control nodes mean the same in another run."""
+    """Identification of a recording, which tells whether its places and frames mean the same."""
 
     name: str
-    """What the recording is called."""
+    """Name of the recording."""
     frames: _Count
-    """How many frames it has."""
+    """Number of its frames."""
     controls: _Count
-    """How many control nodes move the object in it."""
+    """Number of its control nodes."""
 
     @classmethod
     def of(cls, fitted: ObjectRollout, name: str) -> "RecordingMark":
@@ -77,7 +77,7 @@ class EditPreset:
     """Edits under a name, and the object on which they were made."""
 
     name: str
-    """What people call it."""
+    """Its name for people."""
     edits: Edits
     """All edits of the object, its stored ones included."""
     object: ObjectMark
@@ -89,7 +89,7 @@ class EditPreset:
 
     @property
     def label(self) -> str:
-        """What the list shows."""
+        """Its entry in the list."""
         return f"{OWN}{self.name}" if self.is_own else self.name
 
     def misfit(self, object_: ObjectMark, recording: RecordingMark) -> str:

@@ -93,11 +93,12 @@ class ErrorPanel:
         self._folder = server.gui.add_folder("Error per frame")
         with self._folder:
             if warnings:
-                told = ", ".join(
+                texts = ", ".join(
                     without_markup(code.replace("_", " ")) for code in dict.fromkeys(warnings)
                 )
                 server.gui.add_html(
-                    f'<div style="{_STYLE}"><b>Warnings</b> of the fit: {told} (see its page)</div>'
+                    f'<div style="{_STYLE}"><b>Warnings</b> of the fit: {texts} '
+                    "(see its page)</div>"
                 )
             self._text = server.gui.add_html("")
             fit = [PlotCurve(label="fit", color=_FIT)] if np.isfinite(self._track).any() else []

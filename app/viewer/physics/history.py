@@ -10,14 +10,14 @@ MOST_STEPS = 50
 
 
 class TriedSetting(NamedTuple):
-    """What is simulated."""
+    """Setting of a simulation."""
 
     parameters: SimulationParameters
     """Their number of substeps is that in force before the automatic choice."""
     is_automatic: bool = False
     """Whether the number of substeps is chosen automatically."""
     edits: Edits = ()
-    """What is done to single springs and nodes."""
+    """Edits of single springs and nodes."""
 
 
 class History:
@@ -38,7 +38,7 @@ class History:
         """
         self.start = start
         self.begin = self.setting = TriedSetting(start, edits=edits)
-        """What is in force; it was `begin` at first."""
+        """The current setting, `begin` at first."""
         self._steps = [self.setting]
         self._index = 0
         self._before = 0
@@ -62,7 +62,7 @@ class History:
 
     @property
     def index(self) -> int:
-        """Which of the steps is in force."""
+        """Index of the current step."""
         return self._index
 
     def set(self, field: str, value: Any, *, gesture: int = 0) -> TriedSetting:

@@ -37,12 +37,12 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 
 @dataclass(frozen=True, kw_only=True)
 class SavedRun:
-    """How far a run is that was saved from a live scene."""
+    """Progress of a run that was saved from a live scene."""
 
     id: str
     """Its id; its page is ``/runs/<id>``."""
     name: str
-    """What the user calls it."""
+    """Its name, as the user gave it."""
     state: str
     """``"queued"`` or ``"running"``, in the end ``"succeeded"``, ``"failed"``, ``"cancelled"``."""
     error: str | None = None
@@ -258,7 +258,7 @@ _PRESET, _RUN = "Preset", "Run"
 
 @dataclass(frozen=True)
 class UserStorage:
-    """Where a server keeps what users of its scenes have found."""
+    """Storage of a server for runs and presets that users of its scenes keep."""
 
     presets: PresetStore
     """Their presets."""
@@ -424,7 +424,7 @@ class KeepPanel:
         self._storage.tell("keep a preset")
         self._choice.want(preset.label)
         self.show()
-        kept = preset.name
+        text = preset.name
         if history.setting.edits:
-            kept += ": the parameters. Edits are kept in the tab Edit, or with a run."
-        notify(event.client, "Preset saved", kept, color="blue")
+            text += ": the parameters. Edits are kept in the tab Edit, or with a run."
+        notify(event.client, "Preset saved", text, color="blue")

@@ -21,7 +21,7 @@ class Offered(Named, Protocol):
 
     @property
     def label(self) -> str:
-        """What the list shows."""
+        """Its entry in the list."""
         ...
 
     @property
@@ -61,11 +61,11 @@ class KeptChoice(Generic[Listed]):
         self._offered = offered
         self._is_in_force = is_in_force
         self._choose = choose
-        self._kept: dict[str, Listed] = {}
+        self._listed: dict[str, Listed] = {}
         self._wanted = AS_FITTED
         self._turn = threading.Lock()
         self.problems: tuple[str, ...] = ()
-        """What is wrong with files of users."""
+        """Problems of users' files."""
         choice: Any = gui.add_dropdown(label, (AS_FITTED, BY_HAND), hint=hint)
         choice.on_update(guard.by_user(lambda _: self._take_choice()))
         self._choice = FollowedChoice(choice, guard)
@@ -74,8 +74,8 @@ class KeptChoice(Generic[Listed]):
     def refresh(self) -> None:
         """Read again what is offered."""
         offered, self.problems = self._offered()
-        self._kept = {kept.label: kept for kept in offered}
-        self._choice.offer((*self._kept, BY_HAND))
+        self._listed = {entry.label: entry for entry in offered}
+        self._choice.offer((*self._listed, BY_HAND))
         self.show()
 
     def show(self) -> None:
@@ -86,8 +86,8 @@ class KeptChoice(Generic[Listed]):
 
     @property
     def chosen(self) -> Listed | None:
-        """What is in force, if it has a name; of several that was chosen."""
-        fits = {label: kept for label, kept in self._kept.items() if self._is_in_force(kept)}
+        """The current entry, if there is one; of several the one that was chosen."""
+        fits = {label: entry for label, entry in self._listed.items() if self._is_in_force(entry)}
         return fits.get(self._wanted, next(iter(fits.values()), None))
 
     def want(self, label: str) -> None:
@@ -96,13 +96,13 @@ class KeptChoice(Generic[Listed]):
         self.show()
 
     def _take_choice(self) -> None:
-        kept = self._kept.get(self._choice.read())
-        if kept is None:
+        entry = self._listed.get(self._choice.read())
+        if entry is None:
             self.show()  # "By hand" is what the list says, nothing to choose.
             return
-        self._wanted = kept.label
+        self._wanted = entry.label
         try:
-            self._choose(kept)
+            self._choose(entry)
         finally:
             self.show()  # What was refused is not in force.
 

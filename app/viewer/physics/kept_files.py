@@ -1,4 +1,4 @@
-"""What users keep under names for every scene of a server: one file each, in one folder."""
+"""Named items that users keep for every scene of a server: one file each, in one folder."""
 
 import logging
 import re
@@ -22,7 +22,7 @@ class Named(Protocol):
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Its name for people."""
         ...
 
 
@@ -36,11 +36,11 @@ class KeptFiles(Generic[Kept]):
     """
 
     what: str
-    """What one of them is called."""
+    """Word for one of them."""
     kinds: frozenset[str]
-    """How names of its files end; what is new ends as `new_kind` says."""
+    """Suffixes of its files; new ones have `new_kind`."""
     new_kind: str
-    """How names of new files end."""
+    """Suffix of new files."""
 
     def __init__(self, folder: Path, shown_folder: str) -> None:
         """Prepare; the folder is made when the first thing is kept.
@@ -77,14 +77,14 @@ class KeptFiles(Generic[Kept]):
 
     def presets(self) -> tuple[tuple[Kept, ...], tuple[str, ...]]:
         """Read all files by name, and say of each bad one what is wrong with it."""
-        found: list[Kept] = []
+        presets: list[Kept] = []
         problems: list[str] = []
-        for path, kept, problem in self._read():
-            if kept is None:
+        for path, item, problem in self._read():
+            if item is None:
                 problems.append(f"{self._shown_folder}/{path.name}: {problem}")
             else:
-                found.append(kept)
-        return tuple(sorted(found, key=lambda kept: kept.name.casefold())), tuple(problems)
+                presets.append(item)
+        return tuple(sorted(presets, key=lambda item: item.name.casefold())), tuple(problems)
 
     def delete(self, name: str) -> None:
         """Remove what users have kept under a name.
@@ -93,10 +93,10 @@ class KeptFiles(Generic[Kept]):
             UsageError: If there is nothing of that name.
         """
         with self._lock:
-            found = [path for path, kept, _ in self._read() if kept and kept.name == name]
-            if not found:
+            paths = [path for path, item, _ in self._read() if item and item.name == name]
+            if not paths:
                 raise UsageError(f"There is no {self.what} of yours called '{name}'.")
-            found[0].unlink(missing_ok=True)
+            paths[0].unlink(missing_ok=True)
         self._tell()
 
     def _put(self, name: str, write: Callable[[Path], None]) -> None:
@@ -108,14 +108,14 @@ class KeptFiles(Generic[Kept]):
 
     def _place(self, name: str) -> Path:
         """Choose the file of a name: its own, or a free one named after it."""
-        known = list(self._read())
-        for path, kept, _ in known:
-            if kept is not None and kept.name.casefold() == name.casefold():
+        files = list(self._read())
+        for path, item, _ in files:
+            if item is not None and item.name.casefold() == name.casefold():
                 return path
-        if len(known) >= _MOST_FILES:
+        if len(files) >= _MOST_FILES:
             raise UsageError(f"{_MOST_FILES} are kept already. Delete one of them first.")
         stem = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "preset"
-        used = {path.stem for path, _, _ in known}
+        used = {path.stem for path, _, _ in files}
         numbered = (stem if number == 1 else f"{stem}-{number}" for number in range(1, 10**6))
         return self.folder / f"{next(free for free in numbered if free not in used)}{self.new_kind}"
 
@@ -124,20 +124,20 @@ class KeptFiles(Generic[Kept]):
         if not self.folder.is_dir():
             return []
         paths = [path for path in sorted(self.folder.iterdir()) if path.suffix in self.kinds]
-        found: list[tuple[Path, Kept | None, str]] = []
+        files: list[tuple[Path, Kept | None, str]] = []
         names: dict[str, str] = {}
         for path in paths[:_MOST_FILES]:
             if path.name.startswith("."):
                 continue
             try:
-                kept = self.read(path)
-                first = names.setdefault(kept.name.casefold(), path.name)
+                item = self.read(path)
+                first = names.setdefault(item.name.casefold(), path.name)
                 if first != path.name:
-                    raise UsageError(f"name '{kept.name}' is that of {first} too. Rename one.")
-                found.append((path, kept, ""))
+                    raise UsageError(f"name '{item.name}' is that of {first} too. Rename one.")
+                files.append((path, item, ""))
             except (PhysHandiError, OSError) as error:
-                found.append((path, None, describe(error)))
-        return found
+                files.append((path, None, describe(error)))
+        return files
 
     def _tell(self) -> None:
         with self._lock:

@@ -70,7 +70,7 @@ class SliderSet:
 
     @property
     def knobs(self) -> tuple[Knob | Switch, ...]:
-        """What can be moved."""
+        """Controls that change parameters."""
         return tuple(knob for knob, _ in self._controls)
 
     def add(self, *knobs: Knob | Switch) -> None:
@@ -525,10 +525,10 @@ class PhysicsPanel:
 
     def _show_steps(self) -> None:
         """List the steps, each by what it changed."""
-        history, known = self.history, self._step_texts
+        history, earlier = self.history, self._step_texts
         pairs = list(pairwise(history.steps))
         self._step_texts = {
-            pair: known.get(pair) or step_text(self._sliders.knobs, *pair) for pair in pairs
+            pair: earlier.get(pair) or step_text(self._sliders.knobs, *pair) for pair in pairs
         }
         begins = "as fitted" if history.steps[0] == history.begin else "before"
         names = _numbered([begins, *(self._step_texts[pair] for pair in pairs)])

@@ -21,7 +21,7 @@ POWER_DIGITS = 6
 _POWERS = (-2.0, 1.0)
 """Ends of a slider of a power of ten."""
 FACTOR_MARKS = ((-2.0, "×0.01"), (-1.0, "×0.1"), (0.0, "×1"), (1.0, "×10"))
-"""What a slider of a power of ten says; by these marks the page knows it and shows factors."""
+"""Marks of a slider of a power of ten, by which the page recognises it and shows factors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +39,9 @@ class Knob:
     step: float
     """Distance of two slider values."""
     hint: str
-    """What it does."""
+    """Its effect, for the control's hint."""
     name: str = ""
-    """What it is called outside of its folder; empty for the label."""
+    """Its name outside of its folder; empty for the label."""
     scale: float = 1.0
     """Slider value for a parameter of 1."""
     is_integer: bool = False
@@ -88,9 +88,9 @@ class Switch:
     label: str
     """Name beside the box."""
     hint: str
-    """What it does."""
+    """Its effect, for the control's hint."""
     name: str = ""
-    """What it is called outside of its folder; empty for the label."""
+    """Its name outside of its folder; empty for the label."""
 
     def to_slider(self, parameters: SimulationParameters) -> bool:
         """Find whether the box is ticked."""
@@ -215,11 +215,11 @@ class Change:
     """One parameter that is not as fitted."""
 
     name: str
-    """What people call it."""
+    """Its name for people."""
     fields: tuple[str, ...]
     """Fields of `SimulationParameters` that it is."""
     text: str
-    """What became of it, for example ``δ object [mm] 20 → 35``."""
+    """Description of the change, for example ``δ object [mm] 20 → 35``."""
 
 
 def changes_in(

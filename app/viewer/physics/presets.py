@@ -19,7 +19,7 @@ from physhandi.simulation.parameters import (
 
 AS_FITTED = "as fitted"
 BY_HAND = "by hand"
-"""What the list shows while the parameters are those of no preset."""
+"""Entry of the list while the parameters are those of no preset."""
 OWN = "★ "
 """Before the name of a user's preset in the list."""
 _OF_RECORDING = frozenset(name for name, p in PARAMETERS.items() if p.is_of_recording)
@@ -38,10 +38,10 @@ _HOLD = (
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """What differs from the fitted parameters, under a name."""
+    """Named differences from the fitted parameters."""
 
     name: str
-    """What people call it."""
+    """Its name for people."""
     changes: Mapping[str, Any]
     """Parameters and their values; `substeps_per_frame` may be ``"auto"``."""
     length_unit: str = "m"
@@ -51,7 +51,7 @@ class Preset:
 
     @property
     def label(self) -> str:
-        """What the list shows."""
+        """Its entry in the list."""
         return f"{OWN}{self.name}" if self.is_own else self.name
 
     def apply(self, fitted: SimulationParameters) -> tuple[SimulationParameters, bool]:

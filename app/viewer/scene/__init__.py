@@ -1,1 +1,1 @@
-"""What is drawn: hands, object, springs, forces, cameras and recorded points."""
+"""Drawing of hands, object, springs, forces, cameras and recorded points."""

@@ -1,4 +1,4 @@
-"""Where the camera stands at first, and how large points and arrows are drawn."""
+"""Initial camera of a scene, and sizes of points and arrows."""
 
 from dataclasses import dataclass
 
@@ -49,13 +49,13 @@ class Framing:
 
     @property
     def look_at(self) -> Float[ndarray, " 3"]:
-        """Where the camera looks: a little to the right, since the panel covers that side."""
+        """Point in the middle of the picture, right of the center: the panel covers that side."""
         right = np.array([-np.sin(self.azimuth), np.cos(self.azimuth), 0.0])
         return self.center + 0.1 * max(self.extent, self.reach) * right
 
     @property
     def camera(self) -> Float[ndarray, " 3"]:
-        """Where the camera stands, so that everything fits into the picture."""
+        """Position of the camera from which everything fits into the picture."""
         flat = np.array([np.cos(self.azimuth), np.sin(self.azimuth), 0.0])
         up = np.array([0.0, 0.0, 1.0])
         direction = np.cos(self.elevation) * flat + np.sin(self.elevation) * up

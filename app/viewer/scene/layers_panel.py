@@ -88,7 +88,7 @@ def _grid_label(content: Content, framing: Framing) -> str:
 
 
 class LayersPanel:
-    """What is shown, and from where."""
+    """Shown layers, and cameras to look from."""
 
     def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
         """Add the switches where the caller stands; `replace` shows those that are needed."""

@@ -427,9 +427,9 @@ class ClippedNodes(SceneNodes):
     def points(self, name: str, point: ndarray, color: Any, size: float, **options: Any) -> None:
         """Draw the points that are kept, in a size that may change."""
         if self.plane is not None and len(point):
-            kept = self.plane.keeps(point)
-            color = np.asarray(color)[kept] if np.ndim(color) == 2 else color
-            point = point[kept]
+            is_kept = self.plane.keeps(point)
+            color = np.asarray(color)[is_kept] if np.ndim(color) == 2 else color
+            point = point[is_kept]
         super().points(name, point, color, size, **options)
         node = self._nodes.get(name)
         if node is not None and node.point_size != size:
@@ -440,15 +440,15 @@ class ClippedNodes(SceneNodes):
     ) -> None:
         """Draw the lines whose middle is kept."""
         if self.plane is not None and len(segment):
-            kept = self.plane.keeps(segment.mean(axis=1))
-            color = np.asarray(color)[kept] if np.ndim(color) >= 2 else color
-            segment = segment[kept]
+            is_kept = self.plane.keeps(segment.mean(axis=1))
+            color = np.asarray(color)[is_kept] if np.ndim(color) >= 2 else color
+            segment = segment[is_kept]
         super().segments(name, segment, color, width, **options)
 
     def arrows(self, name: str, arrow: ndarray, color: Any, width: float, **options: Any) -> None:
         """Draw the arrows whose start is kept."""
         if self.plane is not None and len(arrow):
-            kept = self.plane.keeps(arrow[:, 0])
-            color = np.asarray(color)[kept] if np.ndim(color) >= 2 else color
-            arrow = arrow[kept]
+            is_kept = self.plane.keeps(arrow[:, 0])
+            color = np.asarray(color)[is_kept] if np.ndim(color) >= 2 else color
+            arrow = arrow[is_kept]
         super().arrows(name, arrow, color, width, **options)

@@ -41,7 +41,7 @@ _OF_RECORDING = 1.4
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """How much of an object may be sent in a frame; None for all of it."""
+    """Limits on what of an object is sent in a frame; None for no limit."""
 
     virtual: int | None = None
     """Most virtual springs."""
@@ -90,7 +90,7 @@ def automatic_force_unit(rollout: ObjectRollout | None, framing: Framing) -> flo
 
 @dataclass(frozen=True, kw_only=True)
 class Style:
-    """How an object is drawn; sizes of nodes are parts of their spacing."""
+    """Drawing style of an object; sizes of nodes are parts of their spacing."""
 
     is_solid: bool = False
     """Whether nodes are shaded spheres instead of disks, which is heavier to show."""

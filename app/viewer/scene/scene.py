@@ -34,15 +34,15 @@ from app.viewer.scene.splat_groups import SplatGroups
 from physhandi.object_rollout import ObjectRollout
 
 FRAME_BYTES = 92_000
-"""What a frame may weigh while the clock is running; springs and arrows give way."""
+"""Largest size of a frame while playing [bytes]; springs and arrows are left out first."""
 _ARROWS = 800
 _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
 _SUNK, _SUNK_FOR_SPLATS = 0.001, 0.015
-"""How far below the ground its grid is, in the scene's extent: splats of what lies there reach
+"""Distance of the grid below the ground, in the scene's extent: splats of what lies there reach
 below it, and lines would be seen through them."""
 _GROUP_BYTES = 70
-"""What the pose of a group of splats weighs, packed."""
+"""Size of the packed pose of a group of splats [bytes]."""
 _LEAST_BYTES = 12_000
 """Springs and arrows get at least this much of a playing frame."""
 _OBSERVED = 0.1
@@ -215,7 +215,7 @@ class SceneDrawing:
 
     @property
     def _hand_opacity(self) -> float | None:
-        """How much hands hide: all where nothing, overlay or video, is to be seen through them."""
+        """Opacity of hands; None if nothing, overlay or video, is to be seen through them."""
         layers = self.layers
         has_overlay = layers.nodes or layers.controls or layers.virtual_springs
         has_overlay = self._content.fitted is not None and (has_overlay or layers.all_controls)

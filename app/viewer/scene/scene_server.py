@@ -1,4 +1,4 @@
-"""What all live scenes share: a viser server of their own, an owner, and who is looking."""
+"""Base of all live scenes: a viser server of their own, an owner, and connected viewers."""
 
 import threading
 import time
@@ -14,14 +14,14 @@ from app.viewer.content.session_state import Kind, Pose, SessionInfo
 from app.viewer.ui.guard import Guard, without_markup
 
 SURROUNDINGS = WEB_ASSETS / "surroundings.jpg"
-"""What lights the scene from all around, 256 x 128 px with a gain map: viser's "city", which is
+"""Environment map that lights the scene, 256 x 128 px with a gain map: viser's "city", which is
 Potsdamer Platz of Poly Haven (CC0), averaged over 4 x 4 px. A browser without a graphics card takes
 a second more to prepare the original; towel and hand look the same, to two of 255 levels."""
 _BRIGHTNESS = 0.4
 """Of that light. With it and the lamps that `web_assets/scene_frame.js` turns down, a towel that
 was recorded as (50, 136, 152) is seen as (43, 136, 160); with all of it as (117, 186, 205)."""
 _FROM_BELOW = 0.9
-"""How brightly what faces down is lit. The surroundings are nearly black there: of the same towel's
+"""Intensity of the light from below. The environment map is nearly black there: of the same towel's
 underside (1, 23, 29) was seen, and (0, 80, 94) is with this."""
 
 
@@ -71,7 +71,7 @@ class SceneServer(ABC):
     """A viser server for one browser tab, which closes when nobody looks for long."""
 
     kind: Kind
-    """What `target` names."""
+    """Kind of the target."""
 
     def __init__(self, session_id: str, *, owner: str, title: str) -> None:
         """Start the server; scene and panel are built by the caller.
@@ -93,12 +93,12 @@ class SceneServer(ABC):
     @property
     @abstractmethod
     def target(self) -> str:
-        """What is shown: an id, or a query."""
+        """The item shown: an id, or a query."""
 
     @property
     @abstractmethod
     def title(self) -> str:
-        """What is shown, for people."""
+        """Title for people."""
 
     @property
     def port(self) -> int:
@@ -107,7 +107,7 @@ class SceneServer(ABC):
 
     @property
     def info(self) -> SessionInfo:
-        """What a listing says about it."""
+        """Entry of a listing for it."""
         return SessionInfo(
             id=self.id,
             kind=self.kind,
@@ -122,12 +122,12 @@ class SceneServer(ABC):
 
     @property
     def offers(self) -> tuple[str, ...]:
-        """What can be done with it; see `SessionInfo`."""
+        """Actions that it offers; see `SessionInfo`."""
         return ()
 
     @property
     def idle(self) -> float:
-        """How long nobody has looked at it [s]."""
+        """Time since a browser was connected [s]."""
         if self._server.get_clients():
             self._seen = time.monotonic()
         return time.monotonic() - self._seen

@@ -34,7 +34,7 @@ class SplatGroups:
     splats: Splats
     """The splats."""
     binding: SplatBinding
-    """Which nodes carry them."""
+    """Binding of the splats to nodes."""
     group: Int[ndarray, " splat"]
     """Number of each splat's group; none is empty."""
 
@@ -82,8 +82,8 @@ class SplatGroups:
         """
         turned = self.binding.rotations(node[None])[0]
         columns = np.swapaxes(turned, 1, 2).reshape(-1, 3)
-        found: ndarray = self._sums @ np.concatenate([columns, node.astype(np.float64)])
-        middle, moment = found[: self.count], found[self.count :].reshape(3, self.count, 3)
+        sums: ndarray = self._sums @ np.concatenate([columns, node.astype(np.float64)])
+        middle, moment = sums[: self.count], sums[self.count :].reshape(3, self.count, 3)
         turn = best_rotations(np.moveaxis(moment, 0, -1), thin=0.0)
         return Rotation.from_matrix(turn).as_quat(scalar_first=True), middle
 

@@ -39,7 +39,7 @@ HeldKey = Literal[
 ]
 """Places of keys on a keyboard, by their names in browsers."""
 Press = Literal["undo", "record", "grip"]
-"""What a key does once when it goes down."""
+"""Actions of keys that act once when they go down."""
 
 _MOVES: dict[str, tuple[int, int]] = {
     "KeyW": (0, 1),
@@ -49,7 +49,7 @@ _MOVES: dict[str, tuple[int, int]] = {
     "KeyE": (2, 1),
     "KeyQ": (2, -1),
 }
-"""Which axis of the view (ahead, right, up) moves the wrist, and which way."""
+"""Axis of the view (ahead, right, up) along which a key moves the wrist, and its sign."""
 _TURNS: dict[str, tuple[int, int]] = {
     "KeyI": (1, -1),
     "KeyK": (1, 1),
@@ -62,7 +62,7 @@ _TURNS: dict[str, tuple[int, int]] = {
 
 
 class _FromPage(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """What the page says."""
+    """Message of the page."""
 
     held: frozenset[HeldKey] | None = None
     press: Press | None = None

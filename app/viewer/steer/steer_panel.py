@@ -24,7 +24,7 @@ from app.viewer.physics.kept_choice import write_small
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
 from app.viewer.steer.key_channel import KeyChannel, Press, velocity_of, view_axes
-from app.viewer.steer.steered import SteeredFrame, SteeredObject, begin_take
+from app.viewer.steer.steered import SteeredFrame, SteeredObject, begin_motion
 from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
@@ -37,7 +37,7 @@ from physhandi.simulation.steering import (
     POSE,
     HandSurface,
     SteeredHand,
-    Take,
+    SteeredMotion,
     from_quaternion,
     to_quaternion,
 )
@@ -61,16 +61,16 @@ _TIP_GIZMO_SIZE, _DOT_SIZE = 0.3, 0.07
 """Length of the axes of a gizmo on a fingertip, and width of the dots by which fingers and wrists
 are chosen: as parts of the hand from its wrist to the tip of its middle finger."""
 _ABOVE_TIP, _ABOVE_WRIST = 0.045, 0.16
-"""How far from tips and wrist dots lie on the backs of fingers and hand, where they are seen:
+"""Distances of the dots from tips and wrist, on the backs of fingers and hand, where they are seen:
 likewise."""
 _SPEED = 0.25
 """Speed of a wrist at first, in extents of the scene a second."""
 _TURN_SPEED = 90.0
 """Turning of a hand at first [°/s]."""
 _CLOSING = 0.8
-"""How fast keys close the fingers of a hand: all the way from open takes 2.5 s [1/s]."""
+"""Speed at which keys close the fingers of a hand: all the way from open takes 2.5 s [1/s]."""
 _GRAVITY = 9.81
-"""What a weight is compared with where nothing falls [m/s²]."""
+"""Gravity that weights are computed with where there is none [m/s²]."""
 _REFRESH = 0.25
 _COUNTED = 1.0
 """Time over which frames are counted [s]."""
@@ -89,7 +89,7 @@ _HOW = (
 class Recorded:
     """A recording of what somebody steered, and how to show it again."""
 
-    take: Take
+    motion: SteeredMotion
     """Its poses, and the state that they begin with."""
     frames: tuple[SteeredFrame, ...]
     """All its frames."""
@@ -98,27 +98,27 @@ class Recorded:
     frame: int
     """Frame of the sequence from which the hands were steered."""
 
-    def part(self, first: int, last: int, seconds: float) -> Take:
-        """Give the take of some of its frames, smoothed.
+    def part(self, first: int, last: int, seconds: float) -> SteeredMotion:
+        """Give the motion of some of its frames, smoothed.
 
         Args:
             first: First frame that is kept.
             last: Last one.
-            seconds: See `Take.smoothed`.
+            seconds: See `SteeredMotion.smoothed`.
         """
         start = self.frames[first].position, self.frames[first].velocity
-        return self.take.part(first, last, start).smoothed(seconds)
+        return self.motion.part(first, last, start).smoothed(seconds)
 
 
-KeepTake = Callable[[Take, int, str, Callable[[SavedRun], None]], None]
-"""Keeps a take that was steered from a frame on, under a name, and reports how far that is."""
+KeepMotion = Callable[[SteeredMotion, int, str, Callable[[SavedRun], None]], None]
+"""Keeps a motion that was steered from a frame on, under a name, and reports how far that is."""
 Shown = tuple[ObjectRollout, int, Mapping[str, Float[ndarray, "vertex 3"]]]
 """Rollout, its frame, and the vertices of each hand [m]."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What keys and the gizmo move: a hand, both, or one finger by its tip."""
+    """Target of keys and the gizmo: a hand, both, or one finger by its tip."""
 
     hands: tuple[int, ...]
     """Numbers of the hands, or that of a point that is held."""
@@ -171,7 +171,7 @@ class SteerPanel:
         stop_comparing: Callable[[], None],
         newtons: Callable[[], float],
         skins: Callable[[], Mapping[str, Mapping[str, ndarray]]],
-        keep: KeepTake | None = None,
+        keep: KeepMotion | None = None,
     ) -> None:
         """Add the tab's controls.
 
@@ -189,7 +189,7 @@ class SteerPanel:
             stop_comparing: Ends a comparison, which shows two objects.
             newtons: Tells the force on the object for one newton of its model.
             skins: Reads the skeletons of the hands that have one; see `HandSkin.to_tensors`.
-            keep: Makes a run and a recording of a take; None where nothing can be kept.
+            keep: Makes a run and a recording of a motion; None where nothing can be kept.
         """
         self._server = server
         self._guard = guard
@@ -206,7 +206,7 @@ class SteerPanel:
         self._skins = skins
         self._keep = keep
         self._recorded: Recorded | None = None
-        self._take_folder: TakeFolder | None = None
+        self._motion_folder: MotionFolder | None = None
         self._lock = threading.RLock()
         self._object: SteeredObject | None = None
         self._moved = Moved((0,))
@@ -217,7 +217,7 @@ class SteerPanel:
         self._surfaces: dict[str, HandSurface] = {}
         self._held: frozenset[str] = frozenset()
         self._gizmo: viser.TransformControlsHandle | None = None
-        self._take: Take | None = None
+        self._motion: SteeredMotion | None = None
         self._nodes = SceneNodes(server)
         self._is_dragged = self._was_dragged = False
         self._refused = ""
@@ -302,7 +302,7 @@ class SteerPanel:
             self._held = frozenset()
             self._remove_gizmo()
             self._nodes.clear()
-            self._take = None
+            self._motion = None
             self._tell()
             self._write(at_once=True)
         if self._was_playing:
@@ -325,7 +325,7 @@ class SteerPanel:
             if self._held:
                 self._drive(steered)  # The camera may have turned.
             rollout, frame, newest = steered.shown()
-            self._offer(newest.take)
+            self._offer(newest.motion)
             self._follow(newest)
             if steered.is_full:
                 self._end_recording(steered)
@@ -333,7 +333,7 @@ class SteerPanel:
             self._write()
             vertices = {
                 hand.name: hand.moved(self._surfaces[hand.name].at(pose), pose)
-                for hand, pose in zip(newest.take.hands, newest.pose, strict=True)
+                for hand, pose in zip(newest.motion.hands, newest.pose, strict=True)
                 if hand.name in self._surfaces
             }
         return rollout, frame, vertices
@@ -341,7 +341,7 @@ class SteerPanel:
     def remove(self) -> None:
         """Take the tab's controls away."""
         self.close()
-        self._show_take(None)
+        self._show_motion(None)
         for command in self._commands:
             command.remove()
         self._folder.remove()
@@ -369,7 +369,7 @@ class SteerPanel:
             for hand in self._content.hands
             if hand.joint is not None
         }
-        self._begin(begin_take(rollout, frame, surfaces, wrists), surfaces)
+        self._begin(begin_motion(rollout, frame, surfaces, wrists), surfaces)
 
     def _surface(self, hand: ShownHand, skins: Mapping[str, Mapping[str, ndarray]]) -> HandSurface:
         """Give a hand in the frame; its fingers move if it has bones."""
@@ -386,19 +386,19 @@ class SteerPanel:
             fingers = Fingers(**joints)
         return HandSurface(shapes=shapes, fingers=fingers)
 
-    def _begin(self, take: Take, surfaces: Mapping[str, HandSurface]) -> None:
-        """Simulate on from the state of a take; called under the lock."""
+    def _begin(self, motion: SteeredMotion, surfaces: Mapping[str, HandSurface]) -> None:
+        """Simulate on from the state of a motion; called under the lock."""
         self._surfaces = dict(surfaces)
         self._object = SteeredObject(
             self._mailbox,
             self._live,
-            take,
+            motion,
             extent=self._extent,
             on_change=self._hear,
         )
         self._limit_force()
         self._arrivals.clear()
-        self._offer(take)
+        self._offer(motion)
         self._tabs.open("Steer")
         self._tell()
         self._write(at_once=True)
@@ -413,7 +413,7 @@ class SteerPanel:
             if steered.is_recording:
                 self._end_recording(steered)
             else:
-                self._show_take(None)
+                self._show_motion(None)
                 steered.record(on=True)
             self._tell()
             self._write(at_once=True)
@@ -425,47 +425,47 @@ class SteerPanel:
         if len(frames) < 2:
             return
         first = frames[0]
-        take = replace(
-            first.take,
+        motion = replace(
+            first.motion,
             start=(first.position, first.velocity),
             pose=np.stack([frame.pose for frame in frames]),
         )
-        self._show_take(
-            Recorded(take=take, frames=frames, surfaces=self._surfaces, frame=self._frame)
+        self._show_motion(
+            Recorded(motion=motion, frames=frames, surfaces=self._surfaces, frame=self._frame)
         )
 
-    def _show_take(self, recorded: Recorded | None) -> None:
+    def _show_motion(self, recorded: Recorded | None) -> None:
         """Offer a recording to be trimmed, smoothed, simulated and kept, or nothing."""
-        if self._take_folder is not None:
-            self._take_folder.remove()
-        self._recorded, self._take_folder = recorded, None
+        if self._motion_folder is not None:
+            self._motion_folder.remove()
+        self._recorded, self._motion_folder = recorded, None
         if recorded is not None:
             with self._folder:
-                self._take_folder = TakeFolder(
+                self._motion_folder = MotionFolder(
                     self._server.gui,
                     self._guard,
                     recorded,
                     play=self._play,
-                    discard=lambda: self._show_take(None),
+                    discard=lambda: self._show_motion(None),
                     keep=self._keep,
                 )
 
-    def _play(self, take: Take) -> None:
-        """Simulate a take again and show it."""
+    def _play(self, motion: SteeredMotion) -> None:
+        """Simulate a motion again and show it."""
         with self._lock:
             recorded = self._recorded
             if recorded is None:
                 return
-            if self._object is not None and self._object.take.model is not take.model:
+            if self._object is not None and self._object.motion.model is not motion.model:
                 self.leave()  # It was recorded from another frame on, or with other grips.
             if self._object is None:
                 self._playback.play(on=False)
                 self._playback.seek(recorded.frame)
                 self._was_playing, self._frame = False, recorded.frame
                 self._stop_comparing()
-                self._begin(replace(take, pose=take.pose[:1]), recorded.surfaces)
+                self._begin(replace(motion, pose=motion.pose[:1]), recorded.surfaces)
             if self._object is not None:
-                self._object.replay(take)
+                self._object.replay(motion)
             self._tell()
 
     def grab(self, node: int) -> None:
@@ -475,11 +475,13 @@ class SteerPanel:
             if steered is None or steered.is_replaying:
                 return
             self._end_recording(steered)
-            take = steered.regrip(
-                lambda take, state, pose: take.hold_point(node, state, pose, _unused_name(take))
+            motion = steered.regrip(
+                lambda motion, state, pose: motion.hold_point(
+                    node, state, pose, _unused_name(motion)
+                )
             )
-            self._offer(take)
-            self._select(Moved((len(take.hands) - 1,)))
+            self._offer(motion)
+            self._select(Moved((len(motion.hands) - 1,)))
 
     @property
     def dots(self) -> Float[ndarray, "dot 3"]:
@@ -500,19 +502,21 @@ class SteerPanel:
             if steered is None or steered.is_replaying:
                 return
             hands = self._moved.hands
-            is_point = self._is_point(steered.take, hands[0])
+            is_point = self._is_point(steered.motion, hands[0])
 
-            def change(take: Take, state: NodeState, pose: Float[ndarray, "hand pose"]) -> Take:
+            def change(
+                motion: SteeredMotion, state: NodeState, pose: Float[ndarray, "hand pose"]
+            ) -> SteeredMotion:
                 if is_point:
-                    return take.without_point(hands[0], state, pose)
-                holding = [hand for hand in hands if take.holds(hand)]
+                    return motion.without_point(hands[0], state, pose)
+                holding = [hand for hand in hands if motion.holds(hand)]
                 for hand in holding or hands:
-                    let_go_or_grip = take.let_go if holding else take.grip
-                    take = let_go_or_grip(hand, state, pose)
-                    pose = take.pose[0]
-                if not holding and not any(take.holds(hand) for hand in hands):
+                    let_go_or_grip = motion.let_go if holding else motion.grip
+                    motion = let_go_or_grip(hand, state, pose)
+                    pose = motion.pose[0]
+                if not holding and not any(motion.holds(hand) for hand in hands):
                     raise UsageError("Nothing of the object is near the hand. Move it nearer.")
-                return take
+                return motion
 
             self._end_recording(steered)
             try:
@@ -523,25 +527,25 @@ class SteerPanel:
                 self._select(Moved((0,)))
             self._write(at_once=True)
 
-    def _is_point(self, take: Take, hand: int) -> bool:
+    def _is_point(self, motion: SteeredMotion, hand: int) -> bool:
         """Whether a hand is a point of the object that is held by itself."""
-        return hand >= max(len(self._content.hands), 1) and hand < len(take.hands)
+        return hand >= max(len(self._content.hands), 1) and hand < len(motion.hands)
 
-    def _what(self, take: Take, hand: int) -> str:
+    def _what(self, motion: SteeredMotion, hand: int) -> str:
         """Name a hand or a point within a sentence."""
-        title = _title(take.hands[hand])
-        return title if self._is_point(take, hand) else f"the {title}"
+        title = _title(motion.hands[hand])
+        return title if self._is_point(motion, hand) else f"the {title}"
 
-    def _offer(self, take: Take) -> None:
-        """Let the hands of a take be chosen, if they are others than before."""
-        if self._take is take:
+    def _offer(self, motion: SteeredMotion) -> None:
+        """Let the hands of a motion be chosen, if they are others than before."""
+        if self._motion is motion:
             return
-        before, self._take = self._take, take
-        names = _choices(take)
+        before, self._motion = self._motion, motion
+        names = _choices(motion)
         if before is None or tuple(names) != tuple(_choices(before)):
             self._choice.options = tuple(names)
             self._choice.visible = len(names) > 1
-            last = len(take.hands) - 1
+            last = len(motion.hands) - 1
             self._select(
                 self._moved
                 if self._moved in names.values()
@@ -550,16 +554,16 @@ class SteerPanel:
 
     def _select(self, moved: Moved) -> None:
         """Move another hand or finger from now on; the others stay where they are."""
-        steered, take = self._object, self._take
-        if steered is None or take is None:
+        steered, motion = self._object, self._motion
+        if steered is None or motion is None:
             return
         self._moved = moved
-        for other in range(len(take.hands)):
+        for other in range(len(motion.hands)):
             if other not in moved.hands:
                 steered.order(other, HandOrder())
         self._remove_gizmo()
-        self._add_gizmo(take, steered.newest.pose)
-        name = next(name for name, its in _choices(take).items() if its == moved)
+        self._add_gizmo(motion, steered.newest.pose)
+        name = next(name for name, its in _choices(motion).items() if its == moved)
         if self._choice.value != name:
             self._choice.value = name
         self._tell()
@@ -571,18 +575,18 @@ class SteerPanel:
             self._gizmo.remove()
         self._gizmo, self._is_dragged, self._was_dragged = None, False, False
 
-    def _add_gizmo(self, take: Take, pose: Float[ndarray, "hand pose"]) -> None:
+    def _add_gizmo(self, motion: SteeredMotion, pose: Float[ndarray, "hand pose"]) -> None:
         hands, finger = self._moved.hands, self._moved.finger
         gizmo = self._gizmo = self._server.scene.add_transform_controls(
             GIZMO,
             scale=(
                 _GIZMO_SIZE * self._extent
                 if finger is None
-                else _TIP_GIZMO_SIZE * _length(take.hands[hands[0]])
+                else _TIP_GIZMO_SIZE * _length(motion.hands[hands[0]])
             ),
-            disable_rotations=not self._turns(take),
+            disable_rotations=not self._turns(motion),
             depth_test=False,
-            position=self._moved.place(take.hands, pose),
+            position=self._moved.place(motion.hands, pose),
         )
 
         # In the order in which the browser has sent them, which threads would not keep.
@@ -591,10 +595,12 @@ class SteerPanel:
 
         gizmo.on_update(moved)
 
-    def _turns(self, take: Take) -> bool:
+    def _turns(self, motion: SteeredMotion) -> bool:
         """Whether the gizmo turns what it moves: two hands have no common wrist."""
         hands = self._moved.hands
-        return self._moved.finger is None and len(hands) == 1 and not self._is_point(take, hands[0])
+        return (
+            self._moved.finger is None and len(hands) == 1 and not self._is_point(motion, hands[0])
+        )
 
     def _drag(self, event: viser.TransformControlsEvent) -> None:
         """Let hands follow the gizmo; two of them keep their places beside it."""
@@ -610,7 +616,7 @@ class SteerPanel:
             if event.phase == "end":
                 self._is_dragged, self._was_dragged = False, True
             newest = steered.newest
-            if max(self._moved.hands) >= len(newest.take.hands):
+            if max(self._moved.hands) >= len(newest.motion.hands):
                 return
             try:
                 if self._moved.finger is None:
@@ -630,7 +636,7 @@ class SteerPanel:
             apart = self._apart.get(number)
             if apart is not None:
                 place, turn = place + apart[:3], to_quaternion(apart[3:6])
-            goal = _goal(newest.take.hands[number], place, turn)
+            goal = _goal(newest.motion.hands[number], place, turn)
             steered.order(number, HandOrder(goal=goal, bend=steered.order_of(number).bend))
 
     def _drag_finger(
@@ -641,30 +647,30 @@ class SteerPanel:
         place: Float[ndarray, " 3"],
     ) -> None:
         (number,) = self._moved.hands
-        told, pose = steered.order_of(number), newest.pose[number].copy()
-        if told.bend is not None:
-            pose[7:] = told.bend
-        bend = newest.take.hands[number].follow(finger, place, pose)
-        steered.order(number, replace(told, bend=tuple(float(angle) for angle in bend)))
+        order, pose = steered.order_of(number), newest.pose[number].copy()
+        if order.bend is not None:
+            pose[7:] = order.bend
+        bend = newest.motion.hands[number].follow(finger, place, pose)
+        steered.order(number, replace(order, bend=tuple(float(angle) for angle in bend)))
 
     def _keep_apart(self, frame: SteeredFrame) -> None:
         """Remember how two hands are turned, and where they are beside their gizmo [m]."""
         self._apart = {}
         if len(self._moved.hands) == 1:
             return
-        middle = self._moved.place(frame.take.hands, frame.pose)
+        middle = self._moved.place(frame.motion.hands, frame.pose)
         for number in self._moved.hands:
             pose = frame.pose[number].copy()
-            pose[:3] += frame.take.hands[number].wrist - middle
+            pose[:3] += frame.motion.hands[number].wrist - middle
             self._apart[number] = pose
 
     def _follow(self, frame: SteeredFrame) -> None:
         """Put the gizmo where the hand is, unless it is being dragged, and draw dots to click."""
-        hands = frame.take.hands
+        hands = frame.motion.hands
         points = [
             hand.wrist + pose[:3]
             for number, (hand, pose) in enumerate(zip(hands, frame.pose, strict=True))
-            if self._is_point(frame.take, number)
+            if self._is_point(frame.motion, number)
         ]
         self._nodes.points(
             "/steer/points",
@@ -675,20 +681,20 @@ class SteerPanel:
         )
         self._dots = {
             moved: place
-            for moved in _choices(frame.take).values()
+            for moved in _choices(frame.motion).values()
             if moved != self._moved and (place := moved.dot(hands, frame.pose)) is not None
         }
         self._nodes.spheres(
             "/steer/dots",
             self.dots,
             _TIP_COLOR,
-            _dot_width(frame.take),
+            _dot_width(frame.motion),
             is_visible=True,
         )
         gizmo = self._gizmo
         if gizmo is None or self._is_dragged:
             return
-        turns, number = self._turns(frame.take), self._moved.hands[0]
+        turns, number = self._turns(frame.motion), self._moved.hands[0]
         position = self._moved.place(hands, frame.pose)
         wxyz = to_quaternion(frame.pose[number, 3:6] if turns else np.zeros(3))
         if self._was_dragged:
@@ -704,7 +710,7 @@ class SteerPanel:
     def _choose(self, name: str) -> None:
         """Move another hand; the one before stays where it is."""
         with self._lock:
-            names = {} if self._take is None else _choices(self._take)
+            names = {} if self._motion is None else _choices(self._motion)
             if name in names:
                 self._select(names[name])
 
@@ -774,13 +780,13 @@ class SteerPanel:
     def _tell(self) -> None:
         """Tell the page whether keys steer."""
         state: dict[str, Any] = {"steering": self.is_on}
-        if self.is_on and self._take is not None:
+        if self.is_on and self._motion is not None:
             hands, finger = self._moved.hands, self._moved.finger
             number = hands[0]
-            state["what"] = _BOTH if len(hands) > 1 else self._what(self._take, number)
+            state["what"] = _BOTH if len(hands) > 1 else self._what(self._motion, number)
             state["both"] = len(hands) > 1
-            state["turns"] = not self._is_point(self._take, number)
-            state["curls"] = self._take.hands[number].curls is not None
+            state["turns"] = not self._is_point(self._motion, number)
+            state["curls"] = self._motion.hands[number].curls is not None
             state["finger"] = "" if finger is None else FINGERS[finger]
             state["recording"] = self._object is not None and self._object.is_recording
         self._channel.tell(state)
@@ -805,7 +811,7 @@ class SteerPanel:
             doing = "Playing the take" if steered.is_replaying else "Steering"
             text = f"<b>{doing} from frame {self._frame}</b><br>{pace}{self._pull(steered.newest)}"
             if steered.is_recording:
-                seconds = (len(steered.recorded) - 1) / steered.take.parameters.frame_rate
+                seconds = (len(steered.recorded) - 1) / steered.motion.parameters.frame_rate
                 text += f"<br>● Recording, {seconds:.1f} s"
         self._status.content = f"<div style='{_STYLE}' data-steering>{text}</div>"
 
@@ -816,14 +822,14 @@ class SteerPanel:
             return ""
         force = self._newtons() * np.linalg.norm(frame.pull, axis=-1)
         return "".join(
-            f"<br>the object pulls at {self._what(frame.take, hand)} with {force[hand]:.2g} N"
+            f"<br>the object pulls at {self._what(frame.motion, hand)} with {force[hand]:.2g} N"
             for hand in hands
         )
 
     def _show_buttons(self, steered: SteeredObject | None) -> None:
         """Say on the buttons what they would do now; those that do nothing are hidden."""
-        is_on, take = steered is not None, self._take
-        holds = take is not None and any(take.holds(hand) for hand in self._moved.hands)
+        is_on, motion = steered is not None, self._motion
+        holds = motion is not None and any(motion.holds(hand) for hand in self._moved.hands)
         is_recording = steered is not None and steered.is_recording
         for button, is_visible, label in (
             (self._button, True, _STOP if is_on else _START),
@@ -836,8 +842,8 @@ class SteerPanel:
                 button.label = label
 
 
-class TakeFolder:
-    """What can be done with a recording: trim and smooth it, simulate it again, keep it."""
+class MotionFolder:
+    """Controls of a recording: trim and smooth it, simulate it again, keep it."""
 
     def __init__(
         self,
@@ -845,9 +851,9 @@ class TakeFolder:
         guard: Guard,
         recorded: Recorded,
         *,
-        play: Callable[[Take], None],
+        play: Callable[[SteeredMotion], None],
         discard: Callable[[], None],
-        keep: KeepTake | None,
+        keep: KeepMotion | None,
     ) -> None:
         """Add the folder where the caller stands.
 
@@ -855,14 +861,14 @@ class TakeFolder:
             gui: Where to.
             guard: Wraps the callbacks.
             recorded: The recording.
-            play: Simulates a take and shows it.
+            play: Simulates a motion and shows it.
             discard: Takes the recording away.
-            keep: Makes a run and a recording of a take; None where nothing can be kept.
+            keep: Makes a run and a recording of a motion; None where nothing can be kept.
         """
         self._recorded = recorded
         self._keep = keep
         last = len(recorded.frames) - 1
-        seconds = last / recorded.take.parameters.frame_rate
+        seconds = last / recorded.motion.parameters.frame_rate
         self._folder = gui.add_folder(f"Take of {seconds:.1f} s")
         with self._folder:
             self._part: Any = gui.add_multi_slider(
@@ -886,7 +892,7 @@ class TakeFolder:
                 "Take", (_PLAY, _DISCARD), hint="Playing simulates what is kept from its start"
             )
             buttons.on_click(
-                guard(lambda event: play(self.take) if event.target.value == _PLAY else discard())
+                guard(lambda event: play(self.motion) if event.target.value == _PLAY else discard())
             )
             if keep is not None:
                 self._name: Any = gui.add_text("take name", "", hint="Of the run and the recording")
@@ -897,8 +903,8 @@ class TakeFolder:
             self._progress: Any = gui.add_html("", visible=False)
 
     @property
-    def take(self) -> Take:
-        """What is kept, smoothed."""
+    def motion(self) -> SteeredMotion:
+        """The trimmed and smoothed motion."""
         first, last = (int(value) for value in self._part.value)
         return self._recorded.part(first, last, float(self._smooth.value))
 
@@ -910,19 +916,19 @@ class TakeFolder:
         """Have a run and a recording made."""
         if self._keep is None:
             return
-        self._keep(self.take, self._recorded.frame, self._name.value, self._report)
+        self._keep(self.motion, self._recorded.frame, self._name.value, self._report)
 
     def _report(self, run: SavedRun) -> None:
         write_small(self._progress, saved_html(run))
 
 
-def _choices(take: Take) -> dict[str, Moved]:
+def _choices(motion: SteeredMotion) -> dict[str, Moved]:
     """Name all that can be moved."""
-    names = {_title(hand): Moved((number,)) for number, hand in enumerate(take.hands)}
-    both = tuple(number for number, hand in enumerate(take.hands) if hand.name in _SIDES)
+    names = {_title(hand): Moved((number,)) for number, hand in enumerate(motion.hands)}
+    both = tuple(number for number, hand in enumerate(motion.hands) if hand.name in _SIDES)
     if len(both) > 1:
         names[_BOTH] = Moved(both)
-    for number, hand in enumerate(take.hands):
+    for number, hand in enumerate(motion.hands):
         if hand.fingers is not None:
             for finger, name in enumerate(FINGERS):
                 names[f"{hand.name} {name}"] = Moved((number,), finger)
@@ -934,9 +940,9 @@ def _title(hand: SteeredHand) -> str:
     return f"{hand.name} hand" if hand.name in _SIDES else hand.name
 
 
-def _dot_width(take: Take) -> float:
+def _dot_width(motion: SteeredMotion) -> float:
     """Tell how wide dots on hands are [m]."""
-    lengths = [_length(hand) for hand in take.hands if hand.fingers is not None]
+    lengths = [_length(hand) for hand in motion.hands if hand.fingers is not None]
     return _DOT_SIZE * max(lengths, default=0.0)
 
 
@@ -946,9 +952,9 @@ def _length(hand: SteeredHand) -> float:
     return float(np.linalg.norm(tip - hand.wrist))
 
 
-def _unused_name(take: Take) -> str:
+def _unused_name(motion: SteeredMotion) -> str:
     """Name a new point."""
-    names = {hand.name for hand in take.hands}
+    names = {hand.name for hand in motion.hands}
     return next(name for number in count(1) if (name := f"point {number}") not in names)
 
 

@@ -16,7 +16,13 @@ from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.fingers import curled
 from physhandi.simulation.restart import NodeState
-from physhandi.simulation.steering import POSE, HandSurface, SteeredHand, Take, nearest_surface
+from physhandi.simulation.steering import (
+    POSE,
+    HandSurface,
+    SteeredHand,
+    SteeredMotion,
+    nearest_surface,
+)
 
 TOP_SPEED = 3.0
 """A wrist moves no faster than this many extents of the scene in a second."""
@@ -24,34 +30,34 @@ FARTHEST_REACH = 5.0
 """A wrist goes no farther than this many extents from where it was."""
 MOST_UNDONE = 50
 """Gestures that can be taken back."""
-LONGEST_TAKE = 60.0
-"""A take is no longer than this [s]."""
+LONGEST_MOTION = 60.0
+"""A motion is no longer than this [s]."""
 _MOST_BYTES = 256 << 20
-"""States of the object that a take may keep, whatever their number."""
+"""States of the object that a motion may keep, whatever their number."""
 
 
 @dataclass(frozen=True, eq=False)
 class SteeredFrame:
     """One simulated frame."""
 
-    take: Take
+    motion: SteeredMotion
     """The hands, and what they hold."""
     position: Float32[ndarray, "node 3"]
     """Object nodes [m]."""
     velocity: Float32[ndarray, "node 3"]
     """Their velocities [m/s]."""
     pose: Float[ndarray, "hand pose"]
-    """Poses of the hands; see `Take`."""
+    """Poses of the hands; see `SteeredMotion`."""
     pull: Float[ndarray, "hand 3"] | None = None
-    """How the object pulls at each hand [N]; None before the first frame was simulated."""
+    """Force of the object on each hand [N]; None before the first frame was simulated."""
 
 
-def begin_take(
+def begin_motion(
     rollout: ObjectRollout,
     frame: int,
     hands: Mapping[str, HandSurface],
     wrists: Mapping[str, Float[ndarray, " 3"]],
-) -> Take:
+) -> SteeredMotion:
     """Let hands be steered from a frame of a rollout on.
 
     Control nodes belong to the hand whose surface is nearest; without hands, to one body.
@@ -89,7 +95,7 @@ def begin_take(
         every = np.arange(moving)
         wrist = recorded[:moving].mean(axis=0)
         steered = (SteeredHand(name="controls", control=every, wrist=wrist),)
-    return Take(
+    return SteeredMotion(
         model=model,
         start=start,
         parameters=rollout.parameters,
@@ -111,7 +117,7 @@ class SteeredObject:
         self,
         mailbox: str,
         live: SimulationClient,
-        take: Take,
+        motion: SteeredMotion,
         *,
         extent: float,
         on_change: Callable[[str, str], None],
@@ -121,7 +127,7 @@ class SteeredObject:
         Args:
             mailbox: Name of the listener, which no other has.
             live: The process.
-            take: The state to begin in, and the hands.
+            motion: The state to begin in, and the hands.
             extent: Size of the scene, which bounds how fast and how far a wrist moves [m].
             on_change: Called with the kind of each message of the process, and why it ended.
         """
@@ -131,18 +137,18 @@ class SteeredObject:
         self._on_change = on_change
         self._lock = threading.Lock()
         self._number = 0
-        self._orders = [HandOrder() for _ in take.hands]
+        self._orders = [HandOrder() for _ in motion.hands]
         self._most_force: float | None = None
-        start = SteeredFrame(take, *take.start, take.pose[0])
+        start = SteeredFrame(motion, *motion.start, motion.pose[0])
         self._before = self._newest = start
         self._durations: deque[float] = deque(maxlen=30)
         self._undone: deque[SteeredFrame] = deque(maxlen=MOST_UNDONE)
         self._recorded: list[SteeredFrame] = []
         self._is_recording = self._is_replaying = False
-        self._replayed = take
-        rate, size = take.parameters.frame_rate, 24 * max(take.model.node_count, 1)
-        self.most_frames = max(2, min(int(LONGEST_TAKE * rate), _MOST_BYTES // size))
-        """Frames of the longest take; then recording ends by itself."""
+        self._replayed = motion
+        rate, size = motion.parameters.frame_rate, 24 * max(motion.model.node_count, 1)
+        self.most_frames = max(2, min(int(LONGEST_MOTION * rate), _MOST_BYTES // size))
+        """Frames of the longest motion; then recording ends by itself."""
         self._rollout = _of_two_frames(start)
         live.subscribe(mailbox, self._receive)
         self._simulate(start)
@@ -160,9 +166,9 @@ class SteeredObject:
             return float(np.median(self._durations)) if self._durations else float("nan")
 
     @property
-    def take(self) -> Take:
+    def motion(self) -> SteeredMotion:
         """The hands now, and what they hold."""
-        return self.newest.take
+        return self.newest.motion
 
     def close(self) -> None:
         """Stop simulating."""
@@ -176,8 +182,8 @@ class SteeredObject:
         Raises:
             UsageError: If a number is not finite, or the goal is out of reach.
         """
-        told = {"velocity": order.velocity, "goal": order.goal or (), "bend": order.bend or ()}
-        for name, values in told.items():
+        numbers = {"velocity": order.velocity, "goal": order.goal or (), "bend": order.bend or ()}
+        for name, values in numbers.items():
             if not np.all(np.isfinite(values)):
                 raise UsageError(f"The {name} of a hand must be finite numbers, not {values}.")
         reach = self._limits.reach
@@ -214,28 +220,29 @@ class SteeredObject:
             self._undone.append(self._newest)
 
     def regrip(
-        self, change: Callable[[Take, NodeState, Float[ndarray, "hand pose"]], Take]
-    ) -> Take:
+        self,
+        change: Callable[[SteeredMotion, NodeState, Float[ndarray, "hand pose"]], SteeredMotion],
+    ) -> SteeredMotion:
         """Change what the hands hold; what was recorded is not recorded any more.
 
         Args:
-            change: Gives the take that begins then, of the one before, the state of the object and
-                the poses of the hands, as `Take.grip` does.
+            change: Gives the motion that begins then, from the one before, the state of the object
+                and the poses of the hands, as `SteeredMotion.grip` does.
 
         Returns:
-            The take that has begun.
+            The motion that has begun.
         """
         with self._lock:
             before = self._newest
-            take = change(before.take, (before.position, before.velocity), before.pose)
+            motion = change(before.motion, (before.position, before.velocity), before.pose)
             self._undone.append(before)
             orders = {
                 hand.name: order
-                for hand, order in zip(before.take.hands, self._orders, strict=True)
+                for hand, order in zip(before.motion.hands, self._orders, strict=True)
             }
-            self._orders = [orders.get(hand.name, HandOrder()) for hand in take.hands]
-            self._go_on(SteeredFrame(take, before.position, before.velocity, take.pose[0]))
-            return take
+            self._orders = [orders.get(hand.name, HandOrder()) for hand in motion.hands]
+            self._go_on(SteeredFrame(motion, before.position, before.velocity, motion.pose[0]))
+            return motion
 
     @property
     def is_recording(self) -> bool:
@@ -251,7 +258,7 @@ class SteeredObject:
 
     @property
     def is_replaying(self) -> bool:
-        """Whether a take is simulated again, so that orders are not followed."""
+        """Whether a motion is simulated again, so that orders are not followed."""
         with self._lock:
             return self._is_replaying
 
@@ -270,18 +277,18 @@ class SteeredObject:
             if not on:
                 self._recorded = []
 
-    def replay(self, take: Take) -> None:
-        """Simulate a take; hands are steered on from its end.
+    def replay(self, motion: SteeredMotion) -> None:
+        """Simulate a motion again; hands are steered on from its end.
 
         Args:
-            take: Of the same hands and object.
+            motion: Of the same hands and object.
         """
         with self._lock:
             self._undone.append(self._newest)
-            self._orders = [HandOrder() for _ in take.hands]
+            self._orders = [HandOrder() for _ in motion.hands]
             self._is_recording, self._is_replaying = False, True
-            self._replayed = take
-            self._number = self._live.steer(self._mailbox, take, self._limits, replays=True)
+            self._replayed = motion
+            self._number = self._live.steer(self._mailbox, motion, self._limits, replays=True)
 
     def undo(self) -> bool:
         """Return to where the last gesture began; returns whether there was one.
@@ -293,9 +300,9 @@ class SteeredObject:
                 return False
             state, was_recording = self._undone.pop(), self._is_recording
             places = [frame is state for frame in self._recorded]
-            kept = places.index(True) + 1 if True in places else 0
-            kept_frames = self._recorded[:kept] or [state]
-            self._orders = [HandOrder() for _ in state.take.hands]
+            count = places.index(True) + 1 if True in places else 0
+            kept_frames = self._recorded[:count] or [state]
+            self._orders = [HandOrder() for _ in state.motion.hands]
             self._go_on(state)
             if was_recording:
                 self._is_recording, self._recorded = True, kept_frames
@@ -311,22 +318,22 @@ class SteeredObject:
         """Give what to draw: a rollout, its frame, and that frame; called by one thread."""
         with self._lock:
             before, newest = self._before, self._newest
-        rollout, take = self._rollout, newest.take
-        if before.take.model is not take.model:
+        rollout, motion = self._rollout, newest.motion
+        if before.motion.model is not motion.model:
             before = newest
-        if rollout.model is not take.model:
+        if rollout.model is not motion.model:
             rollout = self._rollout = _of_two_frames(newest)
         for place, frame in enumerate((before, newest)):
             rollout.position[place] = frame.position
             if rollout.velocity is not None:
                 rollout.velocity[place] = frame.velocity
-            rollout.control[place] = take.control_at(frame.pose)
+            rollout.control[place] = motion.control_at(frame.pose)
         return rollout, 1, newest
 
     def _simulate(self, start: SteeredFrame) -> None:
         """Go on from a state."""
         state = start.position, start.velocity
-        begun = replace(start.take, start=state, pose=start.pose[None])
+        begun = replace(start.motion, start=state, pose=start.pose[None])
         self._is_replaying = False
         self._number = self._live.steer(self._mailbox, begun, self._limits)
         self._drive()
@@ -342,11 +349,11 @@ class SteeredObject:
                 arrays = message.arrays
                 self._before = self._newest
                 # The first one is the state that it goes on from, which is known unless it is that
-                # of a take.
+                # of a motion.
                 if message["frame"] > 0 or self._is_replaying:
-                    take = self._replayed if self._is_replaying else self._newest.take
+                    motion = self._replayed if self._is_replaying else self._newest.motion
                     self._newest = SteeredFrame(
-                        take,
+                        motion,
                         arrays["position"],
                         arrays["velocity"],
                         arrays["pose"],
@@ -359,8 +366,8 @@ class SteeredObject:
                 self._simulate(self._newest)
             else:
                 self._number = 0
-        told = message.fields.get("error", "The live simulation stopped and is started anew.")
-        self._on_change(message.kind, "" if message.kind == "frame" else str(told))
+        reason = message.fields.get("error", "The live simulation stopped and is started anew.")
+        self._on_change(message.kind, "" if message.kind == "frame" else str(reason))
 
     def _keep(self, frame: SteeredFrame) -> None:
         """Record a frame, if frames are recorded and there is room."""
@@ -372,9 +379,9 @@ class SteeredObject:
 def _of_two_frames(frame: SteeredFrame) -> ObjectRollout:
     """Make a rollout of a frame and the one before it, which is the same at first."""
     return ObjectRollout(
-        model=frame.take.model,
-        parameters=frame.take.parameters,
-        control=np.repeat(frame.take.control_at(frame.pose)[None], 2, axis=0),
+        model=frame.motion.model,
+        parameters=frame.motion.parameters,
+        control=np.repeat(frame.motion.control_at(frame.pose)[None], 2, axis=0),
         position=np.repeat(frame.position[None], 2, axis=0),
         velocity=np.repeat(frame.velocity[None], 2, axis=0),
         ready=2,

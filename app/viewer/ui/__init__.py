@@ -1,1 +1,1 @@
-"""What every part of the viewer uses: guarded callbacks, keys, and a viser server of their own."""
+"""Basics of the viewer's parts: guarded callbacks, keys, and a viser server of their own."""

@@ -1,4 +1,4 @@
-"""Where one gesture of a user ends and the next begins."""
+"""Boundaries between gestures of a user."""
 
 from collections.abc import Callable
 from typing import Any

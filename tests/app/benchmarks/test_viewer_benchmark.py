@@ -16,7 +16,7 @@ from app import cli
 from app.benchmarks import browser, latency, splats, streams, viewer
 from app.benchmarks.parts import PARTS
 from app.benchmarks.scenes import HEAVY, HEAVY_ARROWS, HEAVY_NODES, make_heavy_run, make_many_runs
-from app.benchmarks.served import Served, ServerFailedError
+from app.benchmarks.served import Served
 from app.benchmarks.sliders import is_new_frame
 from app.benchmarks.splats import measure_splats, scattered
 from app.benchmarks.streams import percentiles
@@ -26,7 +26,7 @@ from app.settings import BUNDLED, ServerSettings
 from app.viewer.content.layers import OBJECT_FORMS, ObjectForm
 from app.viewer.scene.object_drawing import QUIET_FORCE
 from app.viewer.scene.scene import SceneDrawing
-from physhandi.errors import MissingInputError
+from physhandi.errors import MissingInputError, RunError
 from physhandi.object_rollout import load_fitted
 from physhandi.run import Run
 from physhandi.simulation.object_surface import lay_surface
@@ -286,12 +286,12 @@ def test_a_new_frame_is_one_that_only_the_new_rollout_has() -> None:
 def test_the_heavy_scene_pulls_at_three_hundred_nodes(tmp_path: Path) -> None:
     run = make_heavy_run(tmp_path)
     run.verify()
-    take = load_fitted(run, HEAVY)
-    assert take is not None
-    assert take.model.node_count == HEAVY_NODES == 3000
-    assert take.model.object_spring_count > 5000
+    rollout = load_fitted(run, HEAVY)
+    assert rollout is not None
+    assert rollout.model.node_count == HEAVY_NODES == 3000
+    assert rollout.model.object_spring_count > 5000
     for frame in (1, 30, 58):
-        force = np.linalg.norm(take.forces(frame), axis=-1)
+        force = np.linalg.norm(rollout.forces(frame), axis=-1)
         assert np.count_nonzero(force > QUIET_FORCE) == HEAVY_ARROWS == 300
 
 
@@ -316,5 +316,5 @@ def test_what_is_missing_is_told(
     monkeypatch.setitem(__import__("sys").modules, "playwright.sync_api", None)
     with pytest.raises(MissingInputError, match="pip install playwright"):
         browser.open_chromium().__enter__()
-    with pytest.raises(ServerFailedError, match=r"did not start: .*live_sessions"):
+    with pytest.raises(RunError, match=r"could not be started: .*live_sessions"):
         Served(tmp_path, environment={"PHYSHANDI_LIVE_SESSIONS": "0"})

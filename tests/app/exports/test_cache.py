@@ -157,9 +157,9 @@ def test_what_is_made_once_leaves_nothing_behind(
     file_cache: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = pretend(monkeypatch)
-    with file_cache.once(order, lambda folder: (folder / "take.npz").touch()) as path:
+    with file_cache.once(order, lambda folder: (folder / "rollout.npz").touch()) as path:
         assert path.is_file()
-        assert (Path(made[0].take) / "take.npz").is_file()
+        assert (Path(made[0].rollout) / "rollout.npz").is_file()
         folder = path.parent
     assert not folder.exists()
     with (

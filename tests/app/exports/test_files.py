@@ -132,8 +132,8 @@ def test_a_live_scene_gives_the_rollout_of_its_sliders(
     order = {"kind": "run", "id": "fitted"}
     scene = script.post("/api/v1/sessions", json=order).json()["id"]
     session: Any = world.sessions.get(scene)
-    take = session.snapshot().rollout
-    moved = take.position + np.float32(0.25)
+    rollout = session.snapshot().rollout
+    moved = rollout.position + np.float32(0.25)
     session._object._rollouts.newest.position = moved
     session._playback.seek(2)
     path = f"/api/v1/sessions/{scene}/export"
@@ -167,7 +167,7 @@ def test_a_live_scene_gives_the_rollout_of_its_sliders(
         ("format=npz&drag=-1", 422, "drag"),
         ("format=yaml&drag=1", 422, "yaml"),
         ("format=png&out=/etc/passwd", 422, "out"),
-        ("format=png&take=/etc", 422, "take"),
+        ("format=png&rollout=/etc", 422, "rollout"),
         ("format=png&f=1&f=2", 422, "f"),
     ],
 )

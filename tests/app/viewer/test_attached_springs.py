@@ -26,7 +26,7 @@ LATE = np.int32([[1, 2]])
 
 
 @pytest.fixture
-def take() -> ObjectRollout:
+def rollout() -> ObjectRollout:
     world = two_springs()
     return replace(world, model=replace(world.model, attached=LATE))
 
@@ -53,13 +53,15 @@ class DrawnNodes:
 
 
 @pytest.mark.parametrize(("frame", "held"), [(0, 0), (1, 0), (2, 1), (3, 0)])
-def test_a_spring_is_drawn_while_it_is_attached(take: ObjectRollout, frame: int, held: int) -> None:
+def test_a_spring_is_drawn_while_it_is_attached(
+    rollout: ObjectRollout, frame: int, held: int
+) -> None:
     nodes: Any = DrawnNodes()
     drawing = ObjectDrawing(
         nodes, Framing(center=np.zeros(3), extent=5.0, low=0.0, spacing=1.0, frustum=0.1)
     )
     layers = Layers(object_springs=True, virtual_springs=True, controls=True)
-    drawing.draw(take, frame, layers, Budget(), force_unit=0.01, longest=1.0)
+    drawing.draw(rollout, frame, layers, Budget(), force_unit=0.01, longest=1.0)
     drawn = nodes.drawn
     assert len(drawn["/springs/virtual"]) == held
     assert len(drawn["/springs/object"]) == 1
@@ -67,7 +69,7 @@ def test_a_spring_is_drawn_while_it_is_attached(take: ObjectRollout, frame: int,
     assert len(drawn["/forces"]) == held
     if held:
         np.testing.assert_allclose(drawn["/springs/virtual"][0], [[0, 0, 1], [0, 0, 0]])
-    assert len(drawing.attached(take)) == 1
+    assert len(drawing.attached(rollout)) == 1
 
 
 @pytest.mark.parametrize(
@@ -84,52 +86,52 @@ def test_a_spring_is_drawn_while_it_is_attached(take: ObjectRollout, frame: int,
 )
 def test_contact_is_marked_for_three_frames_when_it_begins_and_ends(frame, begun, ended) -> None:
     world = two_springs(14)
-    take = replace(world, model=replace(world.model, attached=np.int32([[4, 8]])))
-    found = contact_changes(take.model, frame)
+    rollout = replace(world, model=replace(world.model, attached=np.int32([[4, 8]])))
+    found = contact_changes(rollout.model, frame)
     assert [part.tolist() for part in found] == [begun, ended]
     nodes: Any = DrawnNodes()
     drawing = ObjectDrawing(
         nodes, Framing(center=np.zeros(3), extent=5.0, low=0.0, spacing=1.0, frustum=0.1)
     )
-    drawing.draw(take, frame, Layers(), Budget(), force_unit=0.01, longest=1.0)
+    drawing.draw(rollout, frame, Layers(), Budget(), force_unit=0.01, longest=1.0)
     assert len(nodes.drawn["/contact/begins"]) == len(begun)
     assert len(nodes.drawn["/contact/ends"]) == len(ended)
-    drawing.draw(take, frame, Layers(forces=False), Budget(), force_unit=0.01, longest=1.0)
+    drawing.draw(rollout, frame, Layers(forces=False), Budget(), force_unit=0.01, longest=1.0)
     assert len(nodes.drawn["/contact/begins"]) == len(nodes.drawn["/contact/ends"]) == 0
     assert [len(part) for part in contact_changes(world.model, frame)] == [0, 0]
 
 
-def test_what_is_read_of_a_spring_is_of_the_frame(take: ObjectRollout) -> None:
-    content = content_of(take)
+def test_what_is_read_of_a_spring_is_of_the_frame(rollout: ObjectRollout) -> None:
+    content = content_of(rollout)
     painter = Painter(content)
     readings = Readings(content, painter)
     node, control, spring = (
         Pick(kind=kind, index=index) for kind, index in (("node", 0), ("control", 0), ("spring", 1))
     )
-    early, held = (dict(readings.rows(node, take, frame, frame)) for frame in (1, 2))
+    early, held = (dict(readings.rows(node, rollout, frame, frame)) for frame in (1, 2))
     assert (early["held by"], held["held by"]) == ("nothing", "control 0 (80 N)")
     assert early["force of the controls"].startswith("0 N")
     assert held["force of the controls"] == "80 N (0, 0, 80)"
-    assert dict(readings.rows(control, take, 1, 1))["holds"] == "nothing"
-    assert dict(readings.rows(control, take, 2, 2))["holds"] == "node 0 (80 N)"
-    assert [len(readings.links(node, take, frame)) for frame in (1, 2, 3)] == [0, 1, 0]
-    row = dict(readings.rows(spring, take, 2, 2))
+    assert dict(readings.rows(control, rollout, 1, 1))["holds"] == "nothing"
+    assert dict(readings.rows(control, rollout, 2, 2))["holds"] == "node 0 (80 N)"
+    assert [len(readings.links(node, rollout, frame)) for frame in (1, 2, 3)] == [0, 1, 0]
+    row = dict(readings.rows(spring, rollout, 2, 2))
     assert row["attached"] == "from frame 1 to 2"
     assert row["stiffness"] == "80 N"
-    assert dict(readings.rows(spring, take, 3, 3))["stiffness"] == "0 N"
-    for_ever = replace(take, model=replace(take.model, attached=np.int32([[1, NEVER]])))
+    assert dict(readings.rows(spring, rollout, 3, 3))["stiffness"] == "0 N"
+    for_ever = replace(rollout, model=replace(rollout.model, attached=np.int32([[1, NEVER]])))
     assert dict(readings.rows(spring, for_ever, 2, 2))["attached"] == "from frame 1"
     assert "attached" not in dict(readings.rows(spring, two_springs(), 2, 2))
-    curve = follow(node, "force", take, content, painter)
+    curve = follow(node, "force", rollout, content, painter)
     np.testing.assert_allclose(curve, [0.0, 0.0, 80.0, 0.0], atol=1e-5)
 
 
-def test_only_an_attached_spring_can_be_clicked(take: ObjectRollout) -> None:
+def test_only_an_attached_spring_can_be_clicked(rollout: ObjectRollout) -> None:
     def click(frame: int) -> Pick | None:
         eye = np.array([0.0, -3.0, 0.5])
         target = Target(
-            content=content_of(take),
-            rollout=take,
+            content=content_of(rollout),
+            rollout=rollout,
             frame=frame,
             rollout_frame=frame,
             layers=Layers(nodes=False, controls=False, hands=False),
@@ -141,19 +143,19 @@ def test_only_an_attached_spring_can_be_clicked(take: ObjectRollout) -> None:
     assert click(2) == Pick(kind="spring", index=1)
 
 
-def test_saved_frames_tell_what_is_attached(take: ObjectRollout) -> None:
-    counts = [_tables({"shown": (take, frame)})["controls.csv"].decode() for frame in (1, 2)]
+def test_saved_frames_tell_what_is_attached(rollout: ObjectRollout) -> None:
+    counts = [_tables({"shown": (rollout, frame)})["controls.csv"].decode() for frame in (1, 2)]
     assert [line.splitlines()[1].split(",")[-1] for line in counts] == ["0", "1"]
     fields = {"frame": 2, "rollout_frame": 2, "layers": Layers(), "link": ""}
-    for rollout, expected in ((take, LATE.tolist()), (two_springs(), None)):
-        shown = Snapshot(content=content_of(rollout), rollout=rollout, **fields)
+    for saved, expected in ((rollout, LATE.tolist()), (two_springs(), None)):
+        shown = Snapshot(content=content_of(saved), rollout=saved, **fields)
         with np.load(io.BytesIO(snapshot_npz(shown))) as arrays:
             found = arrays["attached"].tolist() if "attached" in arrays else None
         assert found == expected
 
 
-def test_exported_frames_have_the_springs_that_are_attached(take: ObjectRollout) -> None:
-    scene: SceneData = take.scene_data()
+def test_exported_frames_have_the_springs_that_are_attached(rollout: ObjectRollout) -> None:
+    scene: SceneData = rollout.scene_data()
     assert [len(scene.virtual_springs_in(frame)) for frame in range(4)] == [0, 0, 1, 0]
     older = replace(scene, model={k: v for k, v in scene.model.items() if k != "attached"})
     assert [len(older.virtual_springs_in(frame)) for frame in range(4)] == [1, 1, 1, 1]

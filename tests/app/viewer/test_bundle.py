@@ -38,11 +38,11 @@ def snapshot() -> Snapshot:
     content = content_of({"right": (vertex, face)}, controls((0.0, 0.0, 1.0)), (view,))
     assert content.fitted is not None
     position = content.fitted.position + rng.normal(0, 0.002, content.fitted.position.shape)
-    take = replace(content.fitted, position=position.astype(np.float32))
+    rollout = replace(content.fitted, position=position.astype(np.float32))
     return Snapshot(
         content=content,
         frame=4,
-        rollout=take,
+        rollout=rollout,
         rollout_frame=4,
         layers=Layers(),
         link="/runs/x/view?f=4",
@@ -77,14 +77,17 @@ def column(table: list[dict[str, str]], *names: str) -> np.ndarray:
 def test_the_archive_holds_every_number_of_the_frame(snapshot: Snapshot) -> None:
     files = unpack(bundle(snapshot, picture()))
     assert next(iter(files)) == "README.txt"
-    take = snapshot.rollout
-    assert take is not None
-    model, first = take.model, take.model.object_spring_count
+    rollout = snapshot.rollout
+    assert rollout is not None
+    model, first = rollout.model, rollout.model.object_spring_count
     nodes = rows(files["nodes.csv"])
     place = column(nodes, "x_m", "y_m", "z_m")
-    np.testing.assert_allclose(place, take.position[4], atol=1e-7)
+    np.testing.assert_allclose(place, rollout.position[4], atol=1e-7)
     np.testing.assert_allclose(
-        column(nodes, "force_x_N", "force_y_N", "force_z_N"), take.forces(4), rtol=1e-6, atol=1e-9
+        column(nodes, "force_x_N", "force_y_N", "force_z_N"),
+        rollout.forces(4),
+        rtol=1e-6,
+        atol=1e-9,
     )
     control = column(rows(files["controls.csv"]), "x_m", "y_m", "z_m")
     springs = rows(files["springs.csv"])
@@ -102,10 +105,10 @@ def test_the_archive_holds_every_number_of_the_frame(snapshot: Snapshot) -> None
         [int(row["node"]) for row in forces],
         column(forces, "force_x_N", "force_y_N", "force_z_N"),
     )
-    np.testing.assert_allclose(total, take.forces(4), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(total, rollout.forces(4), rtol=1e-5, atol=1e-6)
     assert np.abs(total).max() > 0.1
     with np.load(io.BytesIO(files["frame.npz"])) as arrays:
-        np.testing.assert_array_equal(arrays["position"], take.position[4])
+        np.testing.assert_array_equal(arrays["position"], rollout.position[4])
         np.testing.assert_array_equal(arrays["spring_nodes"], model.spring_nodes)
         hand = snapshot.content.hands[0]
         np.testing.assert_array_equal(arrays["hand_right_vertex"], hand.vertex[4])
@@ -134,17 +137,17 @@ def test_cameras_and_images_are_those_of_the_frame(snapshot: Snapshot) -> None:
 
 
 def test_both_halves_of_a_figure_are_told_apart(snapshot: Snapshot) -> None:
-    take = snapshot.rollout
-    assert take is not None
-    other = replace(take, position=take.position + np.float32(1.0))
-    compared = {"ours": (take, 4), "phystwin": (other, 5)}
+    rollout = snapshot.rollout
+    assert rollout is not None
+    other = replace(rollout, position=rollout.position + np.float32(1.0))
+    compared = {"ours": (rollout, 4), "phystwin": (other, 5)}
     files = unpack(bundle(replace(snapshot, compared=compared), picture()))
     table = rows(files["nodes.csv"])
     shown = column([row for row in table if row["side"] == "phystwin"], "x_m", "y_m", "z_m")
     np.testing.assert_allclose(shown, other.position[5], atol=1e-6)
     with np.load(io.BytesIO(files["frame.npz"])) as arrays:
         np.testing.assert_array_equal(arrays["phystwin_position"], other.position[5])
-        np.testing.assert_array_equal(arrays["ours_position"], take.position[4])
+        np.testing.assert_array_equal(arrays["ours_position"], rollout.position[4])
     assert set(yaml.safe_load(files["parameters.yaml"])) == {"ours", "phystwin"}
 
 

@@ -21,10 +21,10 @@ BUNDLED = Path(__file__).parents[3] / "sequences"
 
 
 def test_values_of_two_springs():
-    take = two_springs()
+    rollout = two_springs()
 
     def at(coloring, frame=2, **options):
-        values = measure(coloring, take, frame, **options)
+        values = measure(coloring, rollout, frame, **options)
         return values.node.tolist(), values.spring.tolist()
 
     nan = np.nan
@@ -44,7 +44,7 @@ def test_values_of_two_springs():
     node, spring = at("force")
     assert node == pytest.approx([80.0, 0.0, 0.0])
     assert spring == [pytest.approx([10.0, 10.0], rel=1e-5), pytest.approx([80.0, 80.0])]
-    other = replace(take, position=take.position + np.float32([0, 0.3, 0.4]))
+    other = replace(rollout, position=rollout.position + np.float32([0, 0.3, 0.4]))
     node, spring = at("difference", reference=other)
     assert node == pytest.approx([0.5] * 3)
     # A control node has no difference of its own: its spring shows the held node's.
@@ -55,9 +55,9 @@ def test_values_of_two_springs():
 
 def test_every_coloring_is_described_and_measured():
     assert set(QUANTITIES) == set(COLORINGS) - {"plain"}
-    take = two_springs()
+    rollout = two_springs()
     for coloring in QUANTITIES:
-        values = measure(coloring, take, 1, error_of=lambda *_: np.zeros(3), reference=take)
+        values = measure(coloring, rollout, 1, error_of=lambda *_: np.zeros(3), reference=rollout)
         assert values.node.shape == (3,)
         assert values.spring.shape == (2, 2)
 
@@ -79,59 +79,59 @@ def test_the_error_of_a_track_is_the_metric_s():
 
 
 def test_an_error_is_told_only_where_something_was_seen():
-    take = two_springs()
+    rollout = two_springs()
     seen = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [1, 1, 1]], bool)
     tracks = Tracks(
-        point=take.position + np.float32([0, 0, 0.25]), is_visible=seen, node=np.array([0, 1, 2])
+        point=rollout.position + np.float32([0, 0, 0.25]), is_visible=seen, node=np.array([0, 1, 2])
     )
-    errors = Painter(content_of(take, tracks=tracks)).errors
-    assert errors.nodes(take, 0) == pytest.approx([0.25] * 3)
-    assert np.isnan(errors.nodes(take, 2)).all()
+    errors = Painter(content_of(rollout, tracks=tracks)).errors
+    assert errors.nodes(rollout, 0) == pytest.approx([0.25] * 3)
+    assert np.isnan(errors.nodes(rollout, 2)).all()
     # Node 1 lies beside track 0, so that this one speaks for it when its own is hidden.
-    assert errors.nodes(take, 1) == pytest.approx([0.25] * 3)
-    assert errors.tracks(take, 1)[1].tolist() == [True, False, True]
+    assert errors.nodes(rollout, 1) == pytest.approx([0.25] * 3)
+    assert errors.tracks(rollout, 1)[1].tolist() == [True, False, True]
 
 
 def test_without_tracks_the_nearest_observed_point_counts():
-    take = two_springs()
+    rollout = two_springs()
     point = np.repeat(np.float32([[[0, 0, 0.5], [1, 0, 0.0]]]), 4, axis=0)
     observed = PointSet(point, np.ones(point.shape[:2], bool))
-    errors = Painter(content_of(take, observed=observed)).errors
+    errors = Painter(content_of(rollout, observed=observed)).errors
     assert errors.source == "the nearest observed point"
-    assert errors.nodes(take, 1)[:2] == pytest.approx([0.5, 0.1], abs=1e-6)
+    assert errors.nodes(rollout, 1)[:2] == pytest.approx([0.5, 0.1], abs=1e-6)
 
 
 def test_the_range_is_that_of_the_sequence_until_it_is_fixed():
-    take = two_springs(20)
-    painter = Painter(content_of(take))
-    first = painter.paint(take, 1, Layers(color="strain"))
-    last = painter.paint(take, 19, Layers(color="strain"))
+    rollout = two_springs(20)
+    painter = Painter(content_of(rollout))
+    first = painter.paint(rollout, 1, Layers(color="strain"))
+    last = painter.paint(rollout, 19, Layers(color="strain"))
     assert first.scale.limits == last.scale.limits
     low, high = last.scale.limits
     assert low == -high
     assert 1.7 < high <= 2.0
     assert painter.legend.highest == pytest.approx(1.9, rel=1e-5)
-    fixed = painter.paint(take, 1, Layers(color="strain", color_range=(0.0, 0.1)))
+    fixed = painter.paint(rollout, 1, Layers(color="strain", color_range=(0.0, 0.1)))
     assert fixed.scale.limits == (0.0, 0.1)
     assert painter.legend.scale.limits == (0.0, 0.1)
     # At 0.1 the scale ends; the third node has no spring.
     np.testing.assert_array_equal(fixed.node[0], table("diverging")[-1])
     np.testing.assert_array_equal(fixed.node[2], UNKNOWN)
     np.testing.assert_array_equal(fixed.springs(slice(0, 1))[0], table("diverging")[[-1, -1]])
-    assert painter.paint(take, 1, Layers()) is None
+    assert painter.paint(rollout, 1, Layers()) is None
     assert painter.legend is None
 
 
 def test_the_range_is_that_of_what_is_shown():
-    take = two_springs()
-    painter = Painter(content_of(take))
+    rollout = two_springs()
+    painter = Painter(content_of(rollout))
     shown = {"nodes": Layers(virtual_springs=False), "virtual": Layers(nodes=False)}
     shown["own"] = Layers(nodes=False, virtual_springs=False, object_springs=True)
     shown["nothing"] = Layers(nodes=False, virtual_springs=False)
     for name, layers in shown.items():
         layers.color = "stiffness"
-        painter.paint(take, 2, layers)
-        low, high = painter.limits("stiffness", take, layers)
+        painter.paint(rollout, 2, layers)
+        low, high = painter.limits("stiffness", rollout, layers)
         # Springs of 20 and 80 N; nodes 0 and 1 are joined by the first alone.
         value = {"virtual": 80.0}.get(name, 20.0)
         assert (low, high) == pytest.approx((value, 2 * value)), name
@@ -141,14 +141,14 @@ def test_the_range_is_that_of_what_is_shown():
 def test_the_range_grows_with_a_rollout_that_is_being_computed():
     fitted = two_springs(20)
     painter = Painter(content_of(fitted))
-    take = replace(fitted, ready=2)
-    assert painter.limits("difference", take)[1] == pytest.approx(1e-3)
-    before = painter.limits("speed", take)
-    take.position[2:, 1, 0] += np.arange(18, dtype=np.float32)
-    take.ready = 3
-    assert painter.limits("speed", take) == before
-    take.ready = 4
-    assert painter.limits("speed", take)[1] > 8 * before[1]
+    rollout = replace(fitted, ready=2)
+    assert painter.limits("difference", rollout)[1] == pytest.approx(1e-3)
+    before = painter.limits("speed", rollout)
+    rollout.position[2:, 1, 0] += np.arange(18, dtype=np.float32)
+    rollout.ready = 3
+    assert painter.limits("speed", rollout) == before
+    rollout.ready = 4
+    assert painter.limits("speed", rollout)[1] > 8 * before[1]
 
 
 def test_colors_are_viridis_and_the_ends_are_reached():
@@ -177,9 +177,9 @@ def test_equal_ratios_are_equal_steps_on_a_logarithmic_scale():
 
 
 def test_units_follow_the_content():
-    take = two_springs()
-    painter = Painter(replace(content_of(take), length_unit="squares"))
+    rollout = two_springs()
+    painter = Painter(replace(content_of(rollout), length_unit="squares"))
     assert (painter.quantity("error").unit, painter.quantity("error").factor) == ("squares", 1.0)
     assert painter.quantity("speed").unit == "squares/s"
     assert painter.quantity("strain").unit == "%"
-    assert Painter(content_of(take)).quantity("error").unit == "mm"
+    assert Painter(content_of(rollout)).quantity("error").unit == "mm"

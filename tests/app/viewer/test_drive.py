@@ -10,7 +10,7 @@ import pytest
 from app.viewer.live.drive import LAG, TOP_TURN, Drives, HandDrive, HandLimits, HandOrder
 from physhandi.simulation.fingers import BENDS, CURLS, Fingers
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.steering import POSE, SteeredHand, Take
+from physhandi.simulation.steering import POSE, SteeredHand, SteeredMotion
 from physhandi.simulation.topology import build_model
 
 RATE = 30.0
@@ -27,7 +27,7 @@ def drive(
     return HandDrive(np.zeros(POSE), frame_rate=RATE, limits=limits, depth=depth)
 
 
-def two_hands(**changes: object) -> Take:
+def two_hands(**changes: object) -> SteeredMotion:
     """Two hands above the ground, one of which was recorded with a node 2 mm in it."""
     control = np.array(
         [[0.0, 0.0, 0.05], [0.04, 0.0, 0.05], [0.5, 0.0, 0.008], [0.54, 0.0, 0.1]], np.float32
@@ -39,7 +39,7 @@ def two_hands(**changes: object) -> Take:
         for name, own in (("right", np.array([0, 1])), ("left", np.array([2, 3])))
     )
     start = (control, np.zeros_like(control))
-    return Take(
+    return SteeredMotion(
         model=model,
         start=start,
         parameters=parameters,
@@ -119,11 +119,11 @@ def test_a_hand_goes_as_far_as_it_reaches_and_turns_round_at_once() -> None:
 
 @pytest.mark.parametrize("kind", ["goal", "velocity"])
 def test_no_hand_goes_through_the_ground(kind: str) -> None:
-    take = two_hands()
-    drives = Drives(take, HandLimits(top_speed=1.0, reach=1.0))
+    motion = two_hands()
+    drives = Drives(motion, HandLimits(top_speed=1.0, reach=1.0))
     down = (0.1, 0.0, -0.5, 0.0, 0.0, 0.0)
     drives.obey([HandOrder(**{kind: down}).to_dict()] * 2, None)
-    height = np.stack([take.control_at(drives.next(np.zeros((2, 3))))[:, 2] for _ in range(60)])
+    height = np.stack([motion.control_at(drives.next(np.zeros((2, 3))))[:, 2] for _ in range(60)])
     # The lowest node of a hand lies on the ground, or where it was recorded below it.
     np.testing.assert_allclose(height[-1], [GROUND, GROUND, 0.008, 0.1], atol=1e-7)
     assert height[:, :2].min() >= GROUND - 1e-7
@@ -133,7 +133,7 @@ def test_no_hand_goes_through_the_ground(kind: str) -> None:
     drives.obey([HandOrder(goal=(0.0, 0.0, -0.5, 0.0, np.pi / 2, 0.0)).to_dict()] * 2, None)
     for _ in range(90):
         pose = drives.next(np.zeros((2, 3)))
-    np.testing.assert_allclose(take.control_at(pose)[:2, 2], [GROUND + 0.04, GROUND], atol=1e-6)
+    np.testing.assert_allclose(motion.control_at(pose)[:2, 2], [GROUND + 0.04, GROUND], atol=1e-6)
 
 
 def test_without_ground_a_hand_goes_down() -> None:
@@ -175,13 +175,13 @@ def test_fingers_close_while_a_key_is_held_and_no_farther_than_a_fist() -> None:
     assert HandOrder.from_dict(hand.order.to_dict()) == hand.order
 
 
-def with_fingers(take: Take) -> Take:
+def with_fingers(motion: SteeredMotion) -> SteeredMotion:
     """Both hands have straight fingers along x that bend down at the wrist, and there alone.
 
     The second of their control nodes, 4 cm away, hangs on the first finger.
     """
     hands = []
-    for hand in take.hands:
+    for hand in motion.hands:
         joint = np.tile(hand.wrist, (len(CURLS), 15, 1))
         weight = np.zeros((2, 15))
         weight[1, 0] = 1.0
@@ -195,14 +195,14 @@ def with_fingers(take: Take) -> Take:
             high=np.full(BENDS, 1.5),
             weight=weight,
         )
-        curls = np.repeat(take.control[hand.control][None], len(CURLS), axis=0)
+        curls = np.repeat(motion.control[hand.control][None], len(CURLS), axis=0)
         hands.append(replace(hand, curls=curls, fingers=fingers))
-    return replace(take, hands=tuple(hands))
+    return replace(motion, hands=tuple(hands))
 
 
 def test_a_finger_goes_smoothly_to_its_bend_and_no_farther_than_its_joint() -> None:
-    take = with_fingers(two_hands(ground_height=None))
-    drives = Drives(take, HandLimits(top_speed=1.0, reach=1.0))
+    motion = with_fingers(two_hands(ground_height=None))
+    drives = Drives(motion, HandLimits(top_speed=1.0, reach=1.0))
     bend = np.zeros(BENDS)
     bend[[1, 6]] = [0.1, 9.0]
     orders = [HandOrder(bend=tuple(bend)), HandOrder()]
@@ -223,8 +223,8 @@ def test_a_finger_goes_smoothly_to_its_bend_and_no_farther_than_its_joint() -> N
 
 
 def test_a_finger_stops_above_the_ground_and_its_wrist_stays() -> None:
-    take = with_fingers(two_hands())
-    drives = Drives(take, HandLimits(top_speed=1.0, reach=1.0))
+    motion = with_fingers(two_hands())
+    drives = Drives(motion, HandLimits(top_speed=1.0, reach=1.0))
     lowered, bend = 0.03, np.zeros(BENDS)
     drives.obey([HandOrder(goal=(0.0, 0.0, -lowered, 0.0, 0.0, 0.0)).to_dict()] * 2, None)
     for _ in range(90):
@@ -234,6 +234,6 @@ def test_a_finger_stops_above_the_ground_and_its_wrist_stays() -> None:
     way = np.stack([drives.next(np.zeros((2, 3)))[0] for _ in range(90)])
     np.testing.assert_array_equal(np.delete(way - before, 8, axis=1), 0.0)
     moved = np.stack([before, *way])[:, None] * [[1.0], [0.0]]
-    height = np.stack([take.control_at(pose)[1, 2] for pose in moved])
+    height = np.stack([motion.control_at(pose)[1, 2] for pose in moved])
     assert (np.diff(height) <= 1e-7).all()
     assert GROUND - 1e-7 <= height[-1] < GROUND + 5e-4

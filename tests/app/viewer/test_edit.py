@@ -29,7 +29,7 @@ from app.viewer.edit.selection import (
 )
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
-from app.viewer.steer.steered import begin_take
+from app.viewer.steer.steered import begin_motion
 from physhandi.errors import UsageError
 from physhandi.run import Run
 
@@ -106,20 +106,20 @@ def test_selections_are_replaced_added_to_and_taken_from() -> None:
 
 
 def test_a_spring_is_selected_where_its_middle_is_while_it_is_attached() -> None:
-    take = two_springs()
+    rollout = two_springs()
     eye = eye_of(POSE, 1.0)
     for kind, middle in (("springs", [0.5, 0.0, 0.0]), ("virtual springs", [0.0, 0.0, 0.5])):
         (place,) = eye.project(np.array([middle]))
         box = Polygon.rectangle(tuple(place - 0.01), tuple(place + 0.01))
-        found = select(eye, box, take, 0, kind)
+        found = select(eye, box, rollout, 0, kind)
         expected = {(0, 1)} if kind == "springs" else {(0, 0)}
         assert (found.springs or found.virtual) == expected
-        assert not select(eye, box, take, 0, "nodes")
+        assert not select(eye, box, rollout, 0, "nodes")
     # In frame 3 node 1 is 0.3 m on, and the middle of its spring 0.15 m.
     (place,) = eye.project(np.array([[0.65, 0.0, 0.0]]))
     box = Polygon.rectangle(tuple(place - 0.01), tuple(place + 0.01))
-    assert select(eye, box, take, 3, "springs").springs == {(0, 1)}
-    assert not select(eye, box, take, 0, "springs")
+    assert select(eye, box, rollout, 3, "springs").springs == {(0, 1)}
+    assert not select(eye, box, rollout, 0, "springs")
 
 
 def test_what_lies_behind_a_surface_is_hidden() -> None:
@@ -166,13 +166,13 @@ def test_hidden_points_are_those_whose_ray_meets_a_triangle_before(
 
 
 def test_nodes_are_joined_and_attached_to_what_is_nearest() -> None:
-    take = two_springs()
-    assert pairs_to_join(take, np.array([0, 1, 2])) == ((0, 2), (1, 2))
+    rollout = two_springs()
+    assert pairs_to_join(rollout, np.array([0, 1, 2])) == ((0, 2), (1, 2))
     with pytest.raises(UsageError, match="joined to each other already"):
-        pairs_to_join(take, np.array([0, 1]))
+        pairs_to_join(rollout, np.array([0, 1]))
     with pytest.raises(UsageError, match="two nodes or more"):
-        pairs_to_join(take, np.array([0]))
-    tied = attach_to_nearest(take, 3, np.array([1]))
+        pairs_to_join(rollout, np.array([0]))
+    tied = attach_to_nearest(rollout, 3, np.array([1]))
     assert (tied.nodes, tied.controls, tied.frame) == ((1,), (0,), 3)
     assert tied.lengths[0] == pytest.approx(np.hypot(1.3, 1.0))
 
@@ -424,8 +424,8 @@ def test_edits_are_saved_as_a_run_and_go_into_a_copy_but_not_into_a_link(
     newest = lambda: session._object.newest  # noqa: E731
     wait(client, lambda: newest().edits and newest().ready > 0)
     rollout, frame = session._object.at(0)
-    assert begin_take(rollout, frame, {}, {}).is_edited
-    assert not begin_take(session._content.fitted, 0, {}, {}).is_edited
+    assert begin_motion(rollout, frame, {}, {}).is_edited
+    assert not begin_motion(session._content.fitted, 0, {}, {}).is_edited
     client.set("name", "Cut sheet")
     client.set("Save as", "Run")
     wait(client, lambda: begun)

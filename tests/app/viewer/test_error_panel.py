@@ -49,14 +49,14 @@ def content():
     return content_of({}, controls((0.0, 0.0, 1.0)))
 
 
-def rollout(content, ready: int) -> ObjectRollout:
+def shifted_rollout(content, ready: int) -> ObjectRollout:
     """A rollout whose nodes are 2 mm a frame to the side of the fitted one."""
     fitted = content.fitted
-    take = ObjectRollout.empty(fitted.model, fitted.parameters, fitted.control)
-    take.position[:] = fitted.position
-    take.position[..., 0] += 0.002 * np.arange(FRAMES)[:, None]
-    take.ready = ready
-    return take
+    rollout = ObjectRollout.empty(fitted.model, fitted.parameters, fitted.control)
+    rollout.position[:] = fitted.position
+    rollout.position[..., 0] += 0.002 * np.arange(FRAMES)[:, None]
+    rollout.ready = ready
+    return rollout
 
 
 def shown(client: ViewerClient) -> str:
@@ -96,7 +96,7 @@ def test_the_fit_and_the_re_simulation_are_told_for_the_current_frame(panel, con
     panel.show(7, is_playing=False)
     client.until(lambda: "fit 7 mm from the tracks" in shown(client))
     assert "re-simulated" not in shown(client)
-    panel.follow(rollout(content, FRAMES), at_once=True)
+    panel.follow(shifted_rollout(content, FRAMES), at_once=True)
     client.until(lambda: "re-simulated 14 mm from the fit" in shown(client))
     client.until(lambda: is_marked(client, 7) and curves(client)[2].any())
     frames, track, again, now = curves(client)
@@ -114,23 +114,23 @@ def test_the_plot_grows_with_the_simulation_and_not_more_often_than_it_is_read(
     (panel, client), (server, _) = panel, server_client
     clock = SimpleNamespace(now=time.monotonic() + 1.0, monotonic=lambda: clock.now)
     monkeypatch.setattr("app.viewer.physics.error_panel.time", clock)
-    take = rollout(content, 5)
+    rollout = shifted_rollout(content, 5)
     panel.show(3, is_playing=False)
-    panel.follow(take, at_once=True)
+    panel.follow(rollout, at_once=True)
     client.until(lambda: len(curves(client)[0]) == 4)
     hear_all(server, client)
     before = len(client.messages)
     for _ in range(48):
         clock.now += 0.005
-        take.ready = min(take.ready + 1, FRAMES - 1)
-        panel.follow(take, at_once=False)
+        rollout.ready = min(rollout.ready + 1, FRAMES - 1)
+        panel.follow(rollout, at_once=False)
     hear_all(server, client)
     assert len(client.messages) - before == 1  # That of being asked to say all.
     clock.now += 0.02
-    panel.follow(take, at_once=False)
+    panel.follow(rollout, at_once=False)
     client.until(lambda: len(curves(client)[0]) == FRAMES - 2)
-    take.ready = FRAMES
-    panel.follow(take, at_once=True)
+    rollout.ready = FRAMES
+    panel.follow(rollout, at_once=True)
     client.until(lambda: len(curves(client)[0]) == FRAMES - 1)
     assert panel.errors == pytest.approx((0.003, 0.006), abs=1e-7)
 
@@ -156,8 +156,8 @@ def test_a_session_follows_frames_and_sliders(measured) -> None:
             client.set("stiffness", -1.0)
             client.until(lambda: "re-simulated" in shown(client))
             client.until(lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts())
-            take, _ = session._object.at(0)
-            offset = take.position - measured.array("sequences/lift/rollout.npy")
+            rollout, _ = session._object.at(0)
+            offset = rollout.position - measured.array("sequences/lift/rollout.npy")
             expected = 1e3 * np.linalg.norm(offset[9].astype(np.float64), axis=1).mean()
             assert expected > 0.1
             client.until(lambda: f"re-simulated {expected:.3g} mm" in shown(client))

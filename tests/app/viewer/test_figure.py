@@ -140,8 +140,8 @@ def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(
     client.until(lambda: text_of(client, "detail_a") == other)
     client.until(lambda: "both sides use them" in said(client))
     strengths = {
-        side: np.sort(np.linalg.norm(take.forces(FRAME), axis=1))[::-1]
-        for side, take in (("a", session._content.fitted), ("b", rival))
+        side: np.sort(np.linalg.norm(rollout.forces(FRAME), axis=1))[::-1]
+        for side, rollout in (("a", session._content.fitted), ("b", rival))
     }
 
     def is_to_scale() -> bool:
@@ -221,19 +221,19 @@ def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> N
         compared={"ours": (ours, FRAME), "phystwin": (rival, FRAME)},
     )
     with np.load(io.BytesIO(snapshot_npz(snapshot))) as saved:
-        for name, take in (("ours", ours), ("phystwin", rival)):
-            np.testing.assert_array_equal(saved[f"{name}_position"], take.position)
-            np.testing.assert_array_equal(saved[f"{name}_control"], take.control)
-            np.testing.assert_array_equal(saved[f"{name}_spring_nodes"], take.model.spring_nodes)
-            np.testing.assert_array_equal(saved[f"{name}_force"][FRAME], take.forces(FRAME))
+        for name, rollout in (("ours", ours), ("phystwin", rival)):
+            np.testing.assert_array_equal(saved[f"{name}_position"], rollout.position)
+            np.testing.assert_array_equal(saved[f"{name}_control"], rollout.control)
+            np.testing.assert_array_equal(saved[f"{name}_spring_nodes"], rollout.model.spring_nodes)
+            np.testing.assert_array_equal(saved[f"{name}_force"][FRAME], rollout.forces(FRAME))
             assert saved[f"{name}_frame"] == FRAME
         forces = {name: saved[f"{name}_force"][FRAME] for name in SIDES}
     rows = list(csv.DictReader(io.StringIO(snapshot_csv(snapshot).decode())))
-    for name, take in (("ours", ours), ("phystwin", rival)):
+    for name, rollout in (("ours", ours), ("phystwin", rival)):
         own = [row for row in rows if row["side"] == name]
         kinds = [row["kind"] for row in own]
         assert kinds.count("node") == 81
-        assert kinds.count("virtual_spring") == take.model.virtual_spring_count > 20
+        assert kinds.count("virtual_spring") == rollout.model.virtual_spring_count > 20
         # The springs' forces, summed over each node, are the node's force.
         total = np.zeros((81, 3))
         for row in own:
@@ -241,18 +241,18 @@ def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> N
             if row["kind"] == "virtual_spring":
                 total[int(row["node"])] += force
                 place = [float(row[f"{axis}_m"]) for axis in "xyz"]
-                control = take.control[FRAME, int(row["control"])]
+                control = rollout.control[FRAME, int(row["control"])]
                 np.testing.assert_allclose(place, control, atol=1e-6)
-                stretched = np.linalg.norm(control - take.position[FRAME, int(row["node"])])
+                stretched = np.linalg.norm(control - rollout.position[FRAME, int(row["node"])])
                 assert float(row["length_m"]) == pytest.approx(stretched, rel=1e-5)
         np.testing.assert_allclose(total, forces[name], atol=1e-3)
         assert np.abs(total).max() > 1.0
 
 
-def replace_rollout(take: ObjectRollout | None, run: Run) -> ObjectRollout:
-    assert take is not None
-    take.position = run.array("sequences/lift/rollout.npy")
-    return take
+def replace_rollout(rollout: ObjectRollout | None, run: Run) -> ObjectRollout:
+    assert rollout is not None
+    rollout.position = run.array("sequences/lift/rollout.npy")
+    return rollout
 
 
 def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -> None:
@@ -264,19 +264,19 @@ def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -
     model = build_model(node, control[0], PARAMETERS)
     assert model.object_spring_count > 4_000
     position = node + np.linspace(0, 0.01, 3, dtype=np.float32)[:, None, None]
-    take = ObjectRollout(
+    rollout = ObjectRollout(
         model=model, parameters=PARAMETERS, control=control, position=position, ready=3
     )
-    assert (np.linalg.norm(take.forces(2), axis=1) > 1e-6).sum() > 2 * ARROWS
+    assert (np.linalg.norm(rollout.forces(2), axis=1) > 1e-6).sum() > 2 * ARROWS
     server, client = server_client
     look = Look(tint="parts")
-    drawing = CompareDrawing(server, content, frame_content(content), [take], look)
+    drawing = CompareDrawing(server, content, frame_content(content), [rollout], look)
     sides = {
         key: ComparedSide(
             name=name,
             title=name,
             detail="",
-            rollout=take,
+            rollout=rollout,
             frame=1,
             content=content,
             content_frame=1,

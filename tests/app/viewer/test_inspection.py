@@ -249,9 +249,9 @@ def test_a_re_simulated_rollout_has_the_same_colors(paused) -> None:
     client.set("drag [1/s]", 15.0)
     client.until(lambda: session._object.at(FRAME)[0].parameters.drag == 15.0)
     client.until(lambda: client.value("Range")[1] > 1.5)
-    take, at = session._object.at(FRAME)
-    assert take.parameters.drag != PARAMETERS.drag
-    distance = 1e3 * take.frame_distance(session._content.fitted, at)
+    rollout, at = session._object.at(FRAME)
+    assert rollout.parameters.drag != PARAMETERS.drag
+    distance = 1e3 * rollout.frame_distance(session._content.fitted, at)
     assert distance > 0
     # The range grows while the rollout is simulated.
     client.until(lambda: distance < client.value("Range")[1] * 2)

@@ -23,7 +23,7 @@ from app.viewer.live.worker import SimulationWorker
 from physhandi.fitted_object import FittedObject
 from physhandi.run import Run
 from physhandi.simulation.edits import Cut, Pin, Release
-from physhandi.simulation.steering import POSE, SteeredHand, Take
+from physhandi.simulation.steering import POSE, SteeredHand, SteeredMotion
 
 LIMITS = HandLimits(top_speed=0.5, reach=1.0)
 TESTS = Path(__file__).parents[2]
@@ -159,13 +159,15 @@ def test_sessions_take_turns(run) -> None:
     assert order == "ab" * FRAMES
 
 
-def steered(run: Run) -> Take:
+def steered(run: Run) -> SteeredMotion:
     """The sheet in its first frame, whose controls are one hand."""
     rollout = FittedObject.of(run.folder, "lift").fitted
     control = np.array(rollout.control[0])
     hand = SteeredHand(name="controls", control=np.arange(30), wrist=control.mean(axis=0))
     model, start = rollout.going_on(0)
-    return Take(model=model, start=start, parameters=PARAMETERS, control=control, hands=(hand,))
+    return SteeredMotion(
+        model=model, start=start, parameters=PARAMETERS, control=control, hands=(hand,)
+    )
 
 
 def test_steering_as_was_recorded_gives_the_recorded_rollout(live, mailbox, run) -> None:
@@ -183,9 +185,9 @@ def test_steering_as_was_recorded_gives_the_recorded_rollout(live, mailbox, run)
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_driven_wrist_takes_what_it_holds_along(live, mailbox, run, axis: int) -> None:
-    take, goal = steered(run), np.zeros(6)
+    motion, goal = steered(run), np.zeros(6)
     goal[axis] = 0.03
-    number = live.steer("a", take, LIMITS, is_paced=False)
+    number = live.steer("a", motion, LIMITS, is_paced=False)
     live.drive("a", [HandOrder(goal=tuple(goal))])
     seen, there = [], 0
     while there < 60:  # So many frames after it has arrived the sheet hangs still.
@@ -195,34 +197,36 @@ def test_a_driven_wrist_takes_what_it_holds_along(live, mailbox, run, axis: int)
             there += np.allclose(message.arrays["pose"][:, :6], [goal], atol=1e-6)
     live.cancel("a")
     assert [m["frame"] for m in seen] == list(range(len(seen)))
-    held = np.unique(take.model.spring_nodes[take.model.object_spring_count :, 0])
-    moved = (seen[-1].arrays["position"] - take.start[0])[held].mean(axis=0)
+    held = np.unique(motion.model.spring_nodes[motion.model.object_spring_count :, 0])
+    moved = (seen[-1].arrays["position"] - motion.start[0])[held].mean(axis=0)
     # The sheet hangs a little lower than it lay.
     np.testing.assert_allclose(moved, goal[:3], atol=0.004)
     assert moved[axis] > 0.025
 
 
 def test_a_hand_that_is_pressed_into_the_table_stays_on_it(live, mailbox, run) -> None:
-    take = steered(run)
-    ground = take.parameters.ground_height
-    number = live.steer("a", take, LIMITS, is_paced=False)
+    motion = steered(run)
+    ground = motion.parameters.ground_height
+    number = live.steer("a", motion, LIMITS, is_paced=False)
     live.drive("a", [HandOrder(goal=(0.0, 0.0, -0.5, 0.0, 0.0, 0.0))])
-    lowest, rested = min(ground, take.control[:, 2].min()), 0
+    lowest, rested = min(ground, motion.control[:, 2].min()), 0
     while rested < 60:
         message = mailbox.until("frame", "diverged")[-1]
         assert message.kind == "frame", message["error"]
         if message["request"] == number:
             pose, position = message.arrays["pose"][0], message.arrays["position"]
-            rested += abs(take.control_at([pose])[:, 2].min() - lowest) < 1e-6
+            rested += abs(motion.control_at([pose])[:, 2].min() - lowest) < 1e-6
     live.cancel("a")
     assert position[:, 2].min() > ground - 1e-6
-    assert np.ptp(position, axis=0)[:2] == pytest.approx(np.ptp(take.start[0], axis=0)[:2], rel=0.2)
+    assert np.ptp(position, axis=0)[:2] == pytest.approx(
+        np.ptp(motion.start[0], axis=0)[:2], rel=0.2
+    )
 
 
 @pytest.mark.parametrize("most", [None, 1500.0])
 def test_a_hand_pulls_no_harder_than_it_may(live, mailbox, run, most: float | None) -> None:
-    take = steered(run)
-    far = take.hold_point(0, take.start, take.pose[0], "point 1")
+    motion = steered(run)
+    far = motion.hold_point(0, motion.start, motion.pose[0], "point 1")
     number = live.steer("a", replace(far, pose=np.zeros((1, 2, POSE))), LIMITS, is_paced=False)
     goal = (0.0, 0.0, 0.3, 0.0, 0.0, 0.0)
     live.drive("a", [HandOrder(goal=goal), HandOrder()], most)
@@ -245,11 +249,11 @@ def test_a_hand_pulls_no_harder_than_it_may(live, mailbox, run, most: float | No
 
 
 def test_what_cannot_be_steered_is_told_and_the_process_lives_on(live, mailbox, run) -> None:
-    process, take = live.process_id, steered(run)
-    live.steer("a", take, LIMITS, is_paced=False)
+    process, motion = live.process_id, steered(run)
+    live.steer("a", motion, LIMITS, is_paced=False)
     live.drive("a", [HandOrder(), HandOrder()])
     assert mailbox.until("failed")[-1]["request"] > 0
-    wild = replace(take, parameters=PARAMETERS.replace(stiffness_scale=1e6))
+    wild = replace(motion, parameters=PARAMETERS.replace(stiffness_scale=1e6))
     live.steer("a", wild, LIMITS, is_paced=False)
     assert "Simulation diverged at frame 1" in mailbox.until("diverged")[-1]["error"]
     assert live.process_id == process

@@ -18,54 +18,54 @@ NODE, SPRING = Pick(kind="node", index=0), Pick(kind="spring", index=1)
 
 
 def test_forces_are_written_for_the_object_and_not_for_nodes_of_a_kilogram() -> None:
-    take = two_springs()
-    content = content_of(take, mass=given_mass(0.3))  # Three nodes: a tenth of the model.
+    rollout = two_springs()
+    content = content_of(rollout, mass=given_mass(0.3))  # Three nodes: a tenth of the model.
     painter = Painter(content)
     readings = Readings(content, painter)
-    assert dict(readings.rows(NODE, take, 2, 2))["held by"] == "control 0 (8 N)"
-    row = dict(readings.rows(SPRING, take, 2, 2))
+    assert dict(readings.rows(NODE, rollout, 2, 2))["held by"] == "control 0 (8 N)"
+    row = dict(readings.rows(SPRING, rollout, 2, 2))
     assert (row["pull"], row["stiffness"]) == ("8 N", "8 N")
     unit, factor = unit_of("force", content, painter)
     assert unit == "N"
-    curve = factor * follow(NODE, "force", take, content, painter)
+    curve = factor * follow(NODE, "force", rollout, content, painter)
     np.testing.assert_allclose(curve, 8.0, rtol=1e-6)
-    painter.paint(take, 2, Layers(color="force"))
+    painter.paint(rollout, 2, Layers(color="force"))
     legend = painter.legend
     assert legend is not None
     assert legend.scale.ticks[-1] == pytest.approx(8.0)  # Rounded as it is written.
     assert legend.scale.quantity.about.endswith("; for an object of 300 g (given)")
-    painter.paint(take, 2, Layers(color="strain"))
+    painter.paint(rollout, 2, Layers(color="strain"))
     assert painter.legend is not None
     assert "300 g" not in painter.legend.scale.quantity.about
 
 
 def test_a_mass_that_is_typed_counts_until_it_is_taken_back() -> None:
-    take = two_springs()
-    painter = Painter(content_of(take, mass=given_mass(0.3)))
+    rollout = two_springs()
+    painter = Painter(content_of(rollout, mass=given_mass(0.3)))
     painter.weigh(3.0)
     assert painter.kilograms == 3.0
     assert painter.quantity("damping").factor == pytest.approx(1.0)
-    assert painter.limits("force", take)[1] == pytest.approx(80.0)
+    assert painter.limits("force", rollout)[1] == pytest.approx(80.0)
     painter.weigh(None)
     assert painter.quantity("damping").factor == pytest.approx(0.1)
     # 80 N of the model are written as 8 N: the end of the scale is round in what is written.
     painter.weigh(0.3 / 7)
-    high = painter.limits("force", take)[1] * painter.force_factor
+    high = painter.limits("force", rollout)[1] * painter.force_factor
     assert high == pytest.approx(1.2)
 
 
 def test_without_a_mass_forces_are_those_of_the_model_and_say_so() -> None:
-    take = two_springs()
-    painter = Painter(content_of(take))
+    rollout = two_springs()
+    painter = Painter(content_of(rollout))
     assert (painter.force_factor, painter.kilograms) == (1.0, 3.0)
     assert painter.quantity("force").about.endswith("; for nodes of 1 kg each")
 
 
 def test_sides_with_other_numbers_of_nodes_are_written_for_one_object() -> None:
-    take = two_springs()
-    model = take.model
+    rollout = two_springs()
+    model = rollout.model
     finer = replace(
-        take,
+        rollout,
         model=replace(
             model,
             object_node=np.concatenate([model.object_node] * 2),
@@ -87,7 +87,7 @@ def test_sides_with_other_numbers_of_nodes_are_written_for_one_object() -> None:
             content_frame=0,
         )
 
-    sides = {"a": side(take, given_mass(0.3)), "b": side(finer, given_mass(0.3))}
+    sides = {"a": side(rollout, given_mass(0.3)), "b": side(finer, given_mass(0.3))}
     assert written_newtons(sides, None) == pytest.approx({"a": 0.1, "b": 0.05})
     assert written_newtons(sides, 0.6) == pytest.approx({"a": 0.2, "b": 0.1})
     unknown = sides | {"b": side(finer, None)}

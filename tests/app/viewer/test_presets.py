@@ -209,7 +209,7 @@ class Loop:
             self._waiting.pop(0)()
 
 
-def take(history: History, parameters: SimulationParameters, is_automatic: bool) -> None:
+def adopt(history: History, parameters: SimulationParameters, is_automatic: bool) -> None:
     history.replace(parameters, is_automatic=is_automatic)
 
 
@@ -230,7 +230,7 @@ def shown_list() -> tuple[History, PresetChoice, SharedList, Loop]:
         history,
         length_unit="m",
         store=None,
-        choose=lambda *setting: take(history, *setting),
+        choose=lambda *setting: adopt(history, *setting),
     )
     loop.work()
     return history, choice, lists[0], loop

@@ -20,17 +20,17 @@ from physhandi.simulation.simulator import Simulator
 
 @pytest.fixture
 def world():
-    take = two_springs()
-    content = content_of(take)
+    rollout = two_springs()
+    content = content_of(rollout)
     painter = Painter(content)
-    return take, content, painter, Readings(content, painter)
+    return rollout, content, painter, Readings(content, painter)
 
 
 def test_a_node_tells_its_state_and_what_holds_it(world):
-    take, _, _, readings = world
+    rollout, _, _, readings = world
     node = Pick(kind="node", index=0)
-    assert readings.title(node, take) == "object node 0"
-    rows = dict(readings.rows(node, take, 2, 2))
+    assert readings.title(node, rollout) == "object node 0"
+    rows = dict(readings.rows(node, rollout, 2, 2))
     assert rows["position"] == "0, 0, 0 m"
     assert rows["velocity"] == "0 m/s (0, 0, 0)"
     # 2 · 40 · (1 / 0.5 - 1) = 80 N upwards, by the control above.
@@ -41,39 +41,39 @@ def test_a_node_tells_its_state_and_what_holds_it(world):
     assert rows["strain"] == "20 %"
     assert rows["difference"] == "0 mm"
     assert rows["object springs"] == "1"
-    lonely = dict(readings.rows(Pick(kind="node", index=2), take, 2, 2))
+    lonely = dict(readings.rows(Pick(kind="node", index=2), rollout, 2, 2))
     assert lonely["held by"] == "nothing"
     assert lonely["strain"] == "not known"
-    moving = dict(readings.rows(Pick(kind="node", index=1), take, 2, 2))
+    moving = dict(readings.rows(Pick(kind="node", index=1), rollout, 2, 2))
     assert moving["velocity"].startswith("3 m/s (3, 0, 0)")
 
 
 def test_a_spring_tells_its_length_and_pull(world):
-    take, _, _, readings = world
+    rollout, _, _, readings = world
     own, virtual = (Pick(kind="spring", index=i) for i in (0, 1))
-    assert readings.title(own, take) == "object spring 0"
-    assert readings.title(virtual, take) == "virtual spring 1"
-    rows = dict(readings.rows(own, take, 2, 2))
+    assert readings.title(own, rollout) == "object spring 0"
+    assert readings.title(virtual, rollout) == "virtual spring 1"
+    rows = dict(readings.rows(own, rollout, 2, 2))
     assert rows["joins"] == "node 0 and node 1"
     assert rows["length"] == "1200 mm, at rest 1000 mm"
     assert rows["strain"] == "20 %"
     # 2 · 10 · 0.2 + 2 · 3 as node 1 runs away.
     assert rows["pull"] == "10 N"
-    rows = dict(readings.rows(virtual, take, 2, 2))
+    rows = dict(readings.rows(virtual, rollout, 2, 2))
     assert rows["joins"] == "control node 0 and node 0"
     assert rows["pull"] == "80 N"
-    np.testing.assert_allclose(readings.place(virtual, take, 2, 2), [[0, 0, 1], [0, 0, 0]])
+    np.testing.assert_allclose(readings.place(virtual, rollout, 2, 2), [[0, 0, 1], [0, 0, 0]])
 
 
 def test_a_spring_after_a_restart_is_read_with_its_new_rest_length():
-    take = two_springs()
-    state = take.position[1].copy()
+    rollout = two_springs()
+    state = rollout.position[1].copy()
     state[1, 0] += 0.11  # The spring of 1.1 m becomes 1.21 m long, 1.1 m of it at rest.
     restart = Restart(frame=1, position=state, velocity=np.zeros_like(state))
-    take = replace(take, restart=restart)
-    readings = Readings(content_of(take), Painter(content_of(take)))
+    rollout = replace(rollout, restart=restart)
+    readings = Readings(content_of(rollout), Painter(content_of(rollout)))
     own = Pick(kind="spring", index=0)
-    before, after = (dict(readings.rows(own, take, frame, frame)) for frame in (1, 2))
+    before, after = (dict(readings.rows(own, rollout, frame, frame)) for frame in (1, 2))
     assert before["length"] == "1100 mm, at rest 1000 mm"
     assert "predicted from" not in before
     assert after["length"] == "1200 mm, at rest 1100 mm"
@@ -81,43 +81,43 @@ def test_a_spring_after_a_restart_is_read_with_its_new_rest_length():
     # 2 · 10 · 0.0909; it gets 0.01 m shorter in the frame, 30 times a second.
     assert after["pull"] == "1.22 N"
     assert after["predicted from"] == "the observed state at frame 1"
-    node = dict(readings.rows(Pick(kind="node", index=1), take, 2, 2))
+    node = dict(readings.rows(Pick(kind="node", index=1), rollout, 2, 2))
     assert node["velocity"].startswith("0.3 m/s")
     assert node["predicted from"] == "the observed state at frame 1"
-    assert readings.exists(own, take)
-    curve = follow(own, "strain", take, content_of(take), Painter(content_of(take)))
+    assert readings.exists(own, rollout)
+    curve = follow(own, "strain", rollout, content_of(rollout), Painter(content_of(rollout)))
     np.testing.assert_allclose(curve, [0.0, 0.1, 1.2 / 1.1 - 1, 1.3 / 1.1 - 1], atol=1e-6)
 
 
 def test_a_control_node_tells_what_it_holds(world):
-    take, _, _, readings = world
-    rows = dict(readings.rows(Pick(kind="control", index=0), take, 2, 2))
+    rollout, _, _, readings = world
+    rows = dict(readings.rows(Pick(kind="control", index=0), rollout, 2, 2))
     assert rows["position"] == "0, 0, 1 m"
     assert rows["force on the object"] == "80 N (0, 0, 80)"
     assert rows["holds"] == "node 0 (80 N)"
-    assert len(readings.links(Pick(kind="control", index=0), take, 2)) == 1
+    assert len(readings.links(Pick(kind="control", index=0), rollout, 2)) == 1
 
 
 def test_what_is_gone_after_a_change_of_springs_exists_no_more(world):
-    take, _, _, readings = world
-    assert readings.exists(Pick(kind="spring", index=1), take)
+    rollout, _, _, readings = world
+    assert readings.exists(Pick(kind="spring", index=1), rollout)
     fewer = replace(
-        take.model,
-        spring_nodes=take.model.spring_nodes[:1],
-        rest_length=take.model.rest_length[:1],
-        stiffness=take.model.stiffness[:1],
-        damping=take.model.damping[:1],
+        rollout.model,
+        spring_nodes=rollout.model.spring_nodes[:1],
+        rest_length=rollout.model.rest_length[:1],
+        stiffness=rollout.model.stiffness[:1],
+        damping=rollout.model.damping[:1],
     )
-    assert not readings.exists(Pick(kind="spring", index=1), replace(take, model=fewer))
+    assert not readings.exists(Pick(kind="spring", index=1), replace(rollout, model=fewer))
     assert not readings.exists(Pick(kind="node", index=0), None)
 
 
 def test_histories_follow_one_thing_over_all_frames(world):
-    take, content, painter, _ = world
+    rollout, content, painter, _ = world
 
     def of(kind, index, history):
         unit, factor = unit_of(history, content, painter)
-        curve = follow(Pick(kind=kind, index=index), history, take, content, painter)
+        curve = follow(Pick(kind=kind, index=index), history, rollout, content, painter)
         return unit, (factor * curve).tolist()
 
     assert of("node", 1, "speed") == ("m/s", pytest.approx([3.0] * 4, rel=1e-5))
@@ -128,7 +128,7 @@ def test_histories_follow_one_thing_over_all_frames(world):
     assert of("node", 0, "force") == ("N", pytest.approx([80] * 4))
     assert of("control", 0, "force") == ("N", pytest.approx([80] * 4))
     assert of("control", 0, "height") == ("mm", pytest.approx([1000] * 4))
-    painter.reference = replace(take, position=take.position + np.float32([0, 0.3, 0.4]))
+    painter.reference = replace(rollout, position=rollout.position + np.float32([0, 0.3, 0.4]))
     assert of("node", 1, "difference") == ("mm", pytest.approx([500] * 4))
     for kind, histories in HISTORIES.items():
         for history in histories:
@@ -137,20 +137,20 @@ def test_histories_follow_one_thing_over_all_frames(world):
 
 
 def test_a_force_is_averaged_between_frames_once_all_of_them_are_ready():
-    take = hanging_node(stiffness=np.array([6300.0], np.float32))
-    simulator = Simulator(take.model, take.parameters)
-    for frame, position, velocity in simulator.frames(take.control):
-        take.position[frame], take.velocity[frame] = position, velocity
-    take.ready = take.frame_count - 1
-    content = content_of(take)
+    rollout = hanging_node(stiffness=np.array([6300.0], np.float32))
+    simulator = Simulator(rollout.model, rollout.parameters)
+    for frame, position, velocity in simulator.frames(rollout.control):
+        rollout.position[frame], rollout.velocity[frame] = position, velocity
+    rollout.ready = rollout.frame_count - 1
+    content = content_of(rollout)
     painter = Painter(content)
 
     def of(kind, index):
-        return follow(Pick(kind=kind, index=index), "mean force", take, content, painter)
+        return follow(Pick(kind=kind, index=index), "mean force", rollout, content, painter)
 
     assert np.isnan(of("node", 0)).all()
-    take.ready += 1
-    own = take.mean_tensions()[:, 0]
+    rollout.ready += 1
+    own = rollout.mean_tensions()[:, 0]
     for kind in ("spring", "control", "node"):
         np.testing.assert_allclose(of(kind, 0), np.abs(own), rtol=1e-5, atol=1e-3)
     assert 7.0 < own[1:].min() < own[1:].max() < 13.0

@@ -10,7 +10,7 @@ from spring_world import content_of, two_springs
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, FakeSettings, FolderCatalog, make_run
 
-from app.exports.making import load_take, store_take
+from app.exports.making import load_rollout, store_rollout
 from app.viewer.clock.restart_mark import mark_html, restart_frame
 from app.viewer.sessions import Sessions
 from physhandi.data.layout import SequenceFiles
@@ -27,12 +27,12 @@ def test_the_tick_stands_where_the_slider_has_the_frame() -> None:
 
 
 def test_only_a_restart_that_a_frame_follows_is_marked() -> None:
-    take = two_springs(frames=4)
+    rollout = two_springs(frames=4)
     still = np.zeros((3, 3), np.float32)
     for frame, marked in ((0, 0), (2, 2), (3, None), (7, None)):
         restart = Restart(frame=frame, position=still, velocity=still)
-        assert restart_frame(content_of(replace(take, restart=restart))) == marked
-    assert restart_frame(content_of(take)) is None
+        assert restart_frame(content_of(replace(rollout, restart=restart))) == marked
+    assert restart_frame(content_of(rollout)) is None
 
 
 def drawn(client: ViewerClient) -> str:
@@ -57,11 +57,11 @@ def test_a_live_simulation_restarts_too_and_another_sequence_does_not(tmp_path: 
             client.until(lambda: told in drawn(client))
             client.set("drag [1/s]", 9.0)
             client.until(lambda: "every frame is new" in drawn(client))
-            take, _ = session._object.at(FRAMES - 1)
+            rollout, _ = session._object.at(FRAMES - 1)
             expected = FittedObject.of(run, "lift").simulate(drag=9.0)
-            np.testing.assert_array_equal(take.position, expected.position)
-            np.testing.assert_array_equal(take.strains(AT + 1), expected.strains(AT + 1))
-            plain = take.model.rest_length - take.model_in(AT + 1).rest_length
+            np.testing.assert_array_equal(rollout.position, expected.position)
+            np.testing.assert_array_equal(rollout.strains(AT + 1), expected.strains(AT + 1))
+            plain = rollout.model.rest_length - rollout.model_in(AT + 1).rest_length
             assert np.abs(plain).max() > 1e-4
             client.set("Sequence", "drag")
             client.until(lambda: session._content.sequence_name == "drag")
@@ -71,11 +71,11 @@ def test_a_live_simulation_restarts_too_and_another_sequence_does_not(tmp_path: 
 
 
 def test_a_rollout_that_is_handed_over_for_a_file_keeps_its_restart(tmp_path: Path) -> None:
-    take = two_springs(frames=4)
-    state = take.position[1] + np.float32([0.1, 0.0, 0.0])
+    rollout = two_springs(frames=4)
+    state = rollout.position[1] + np.float32([0.1, 0.0, 0.0])
     state[0] = 0.0
     restart = Restart(frame=1, position=state, velocity=np.zeros_like(state))
-    store_take(tmp_path, replace(take, restart=restart))
-    again = load_take(tmp_path)
-    np.testing.assert_array_equal(again.strains(2), replace(take, restart=restart).strains(2))
-    assert again.strains(2)[0] != pytest.approx(take.strains(2)[0], abs=1e-3)
+    store_rollout(tmp_path, replace(rollout, restart=restart))
+    again = load_rollout(tmp_path)
+    np.testing.assert_array_equal(again.strains(2), replace(rollout, restart=restart).strains(2))
+    assert again.strains(2)[0] != pytest.approx(rollout.strains(2)[0], abs=1e-3)

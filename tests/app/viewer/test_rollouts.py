@@ -83,10 +83,10 @@ def start(rollouts: LiveRollouts, live: FakeLive, count: int) -> int:
 
 def test_frames_that_are_not_simulated_yet_show_the_rollout_before(rollouts, live) -> None:
     start(rollouts, live, 3)
-    take, frame = rollouts.at(2)
-    assert (take.position[frame] == 2.0).all()
-    take, frame = rollouts.at(3)
-    assert (take, frame) == (rollouts.fitted, 3)
+    rollout, frame = rollouts.at(2)
+    assert (rollout.position[frame] == 2.0).all()
+    rollout, frame = rollouts.at(3)
+    assert (rollout, frame) == (rollouts.fitted, 3)
     readout = rollouts.readout
     assert (readout.simulated_count, readout.frame_count, readout.is_busy) == (3, FRAMES, True)
     assert readout.frame_duration == pytest.approx(0.25)
@@ -100,10 +100,10 @@ def test_edits_are_asked_for_until_they_are_taken_back(rollouts, live) -> None:
     live.say("started", 1, model.to_tensors(), substeps_per_frame=30)
     node = np.ones((81, 3), np.float32)
     live.say("frame", 1, {"position": node, "velocity": node}, frame=0, duration=0.1)
-    take, _ = rollouts.at(0)
-    assert take.edits == edits
-    assert take.control.shape == (FRAMES, 31, 3)
-    np.testing.assert_allclose(take.control[:, 30, :2], np.tile([[0.1, 0.2]], (FRAMES, 1)))
+    rollout, _ = rollouts.at(0)
+    assert rollout.edits == edits
+    assert rollout.control.shape == (FRAMES, 31, 3)
+    np.testing.assert_allclose(rollout.control[:, 30, :2], np.tile([[0.1, 0.2]], (FRAMES, 1)))
     # A slider leaves them in force.
     rollouts.request(PARAMETERS.replace(drag=7.0), automatic_substeps=False)
     assert live.requests[-1].edits == edits
@@ -126,9 +126,9 @@ def test_answers_to_an_older_request_are_refused(rollouts, live, changes) -> Non
 def test_divergence_keeps_the_last_good_state(rollouts, live, changes) -> None:
     number = start(rollouts, live, 5)
     live.say("diverged", number, error="Simulation diverged at frame 5.", frame=5)
-    take, frame = rollouts.at(FRAMES - 1)
+    rollout, frame = rollouts.at(FRAMES - 1)
     assert frame == 4
-    assert (take.position[frame] == 4.0).all()
+    assert (rollout.position[frame] == 4.0).all()
     assert rollouts.readout.error == "Simulation diverged at frame 5."
     assert not rollouts.readout.is_busy
     assert changes[-1] == ("diverged", 5)
@@ -137,8 +137,8 @@ def test_divergence_keeps_the_last_good_state(rollouts, live, changes) -> None:
 def test_divergence_before_the_first_frame_keeps_the_rollout_before(rollouts, live) -> None:
     rollouts.request(PARAMETERS.replace(drag=7.0), automatic_substeps=False)
     live.say("failed", 1, error="no")
-    take, frame = rollouts.at(6)
-    assert (take, frame) == (rollouts.fitted, 6)
+    rollout, frame = rollouts.at(6)
+    assert (rollout, frame) == (rollouts.fitted, 6)
     assert rollouts.readout.error == "no"
 
 
@@ -164,9 +164,9 @@ def test_a_crash_without_retry_ends_the_waiting(rollouts, live) -> None:
 
 
 def test_forces_are_those_of_the_virtual_springs(rollouts) -> None:
-    take, frame = rollouts.at(10)
-    force = take.forces(frame)
-    model = take.model
+    rollout, frame = rollouts.at(10)
+    force = rollout.forces(frame)
+    model = rollout.model
     held = np.unique(model.spring_nodes[model.object_spring_count :, 0])
     assert np.abs(np.delete(force, held, axis=0)).max() == 0.0
     assert force[held].sum(axis=0)[2] > 10.0

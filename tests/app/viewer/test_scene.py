@@ -62,23 +62,23 @@ def test_a_large_scene_is_thinned_while_it_plays_and_whole_when_it_rests(
     server, color, surface
 ) -> None:
     content = large_content()
-    take = content.fitted
-    assert take is not None
-    assert take.model.object_spring_count > 10 * PLAYING_SPRINGS
+    rollout = content.fitted
+    assert rollout is not None
+    assert rollout.model.object_spring_count > 10 * PLAYING_SPRINGS
     scene = SceneDrawing(server, content, frame_content(content))
     layers = scene.layers
     layers.object_springs = layers.virtual_springs = layers.controls = layers.nodes = True
     layers.color, layers.surface = color, surface
     springs = "/springs/object" if color == "plain" else "/springs/object_painted"
-    scene.draw(0, take, 0, is_playing=True)
+    scene.draw(0, rollout, 0, is_playing=True)
     with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
         hear_all(server, client)
         assert springs in client.nodes
         before = client.bytes_received
         for frame in range(1, FRAMES):
-            scene.draw(frame, take, frame, is_playing=True)
+            scene.draw(frame, rollout, frame, is_playing=True)
             hear_all(server, client)
         each = (client.bytes_received - before) / (FRAMES - 1)
         assert 60_000 < each < 100_000
-        scene.draw(FRAMES - 1, take, FRAMES - 1, is_playing=False)
+        scene.draw(FRAMES - 1, rollout, FRAMES - 1, is_playing=False)
         client.until(lambda: client.bytes_received - before > 1_000_000)

@@ -118,9 +118,9 @@ def test_the_other_sequence_of_a_run_can_be_chosen(sessions, run) -> None:
         # The fitted rollout is simulated to its end already; only another one tells its pace.
         client.until(lambda: "×0.1" in client.texts() and " ms a frame" in client.texts())
         client.until(lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts())
-        take, _ = session._object.at(0)
+        rollout, _ = session._object.at(0)
         control = run.array("sequences/drag/control.npy")
-        np.testing.assert_array_equal(np.asarray(take.control), control)
+        np.testing.assert_array_equal(np.asarray(rollout.control), control)
 
 
 def test_an_error_in_a_callback_is_logged_and_shown(sessions, caplog) -> None:

@@ -194,11 +194,11 @@ def test_what_comes_next_is_what_there_is(catalog) -> None:
 def test_a_playing_frame_of_many_splats_is_small(server, catalog) -> None:
     content = open_run_content(catalog, "seen")
     content = replace(content, splats=splats_on(sheet(), 20_000))
-    take = content.fitted
-    assert take is not None
+    rollout = content.fitted
+    assert rollout is not None
     scene = SceneDrawing(server, content, frame_content(content))
     scene.layers.splats, scene.layers.surface = True, False
-    scene.draw(0, take, 0, is_playing=True)
+    scene.draw(0, rollout, 0, is_playing=True)
     with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
         hear_all(server, client)
         assert sum(name.startswith("/object/splats/") for name in client.nodes) == MOST_GROUPS
@@ -207,13 +207,13 @@ def test_a_playing_frame_of_many_splats_is_small(server, catalog) -> None:
         )
         before = client.bytes_received
         for frame in range(1, 7):
-            scene.draw(frame, take, frame, is_playing=True)
+            scene.draw(frame, rollout, frame, is_playing=True)
             hear_all(server, client)
         # What lies on the ground reaches below it, and no line of the grid may be seen through it.
         ground: Any = server.scene._handle_from_node_name["/ground"]
         deep, extent = ground.position[2], frame_content(content).extent
         scene.layers.splats, scene.layers.surface = False, True
-        scene.draw(7, take, 7, is_playing=True)
+        scene.draw(7, rollout, 7, is_playing=True)
         assert ground.position[2] - deep == pytest.approx(0.014 * extent, rel=1e-3)
         moved = client.positions["/object/splats/000"]
         assert np.isfinite(moved).all()

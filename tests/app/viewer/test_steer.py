@@ -158,7 +158,7 @@ def record(session: Session, client: ViewerClient) -> Recorded:
     wait(client, lambda: client.find("Keep"))
     hold(session)
     recorded = session._steer._recorded
-    np.testing.assert_array_equal(recorded.take.pose, [frame.pose for frame in recorded.frames])
+    np.testing.assert_array_equal(recorded.motion.pose, [frame.pose for frame in recorded.frames])
     return recorded
 
 
@@ -176,7 +176,7 @@ def test_a_recording_is_trimmed_and_played_whenever_that_is_wanted(scene) -> Non
         np.testing.assert_array_equal(session._steer._object.newest.pose, recorded.frames[-1].pose)
 
     client.set("Keep", (3, last))
-    wait(client, lambda: session._steer._take_folder.take.frame_count == last - 2)
+    wait(client, lambda: session._steer._motion_folder.motion.frame_count == last - 2)
     plays()
     client.set(BACK, True)
     wait(client, lambda: client.find(STEER))
@@ -196,14 +196,14 @@ def test_a_recording_is_kept_as_a_run_and_a_recording(
     recorded = record(session, client)
     last = len(recorded.frames) - 1
     client.set("Keep", (3, last))
-    wait(client, lambda: session._steer._take_folder.take.frame_count == last - 2)
+    wait(client, lambda: session._steer._motion_folder.motion.frame_count == last - 2)
     client.set("take name", "Up & round")
-    wait(client, lambda: session._steer._take_folder._name.value == "Up & round")
+    wait(client, lambda: session._steer._motion_folder._name.value == "Up & round")
     client.set("Save as run and recording", True)
     wait(client, lambda: noted)
     assert noted == [("me", "keep a take", begun[0].id)]
     run_job(begun[0])
-    wait(client, lambda: "Saved as run" in session._steer._take_folder._progress.content)
+    wait(client, lambda: "Saved as run" in session._steer._motion_folder._progress.content)
     run = Run.open(begun[0].folder)
     rollout = run.array("sequences/Up_round/rollout.npy")
     np.testing.assert_array_equal(rollout, [frame.position for frame in recorded.frames[3:]])
@@ -211,7 +211,7 @@ def test_a_recording_is_kept_as_a_run_and_a_recording(
     sequence = Sequence.load(tmp_path / "sequences" / "Up_round")
     sequence.validate()
     np.testing.assert_array_equal(sequence.marker, rollout)
-    np.testing.assert_array_equal(sequence.control, recorded.take.controls()[3:])
+    np.testing.assert_array_equal(sequence.control, recorded.motion.controls()[3:])
     assert sequence.meta.provenance == {
         "origin": "steered by hand in the viewer",
         "run": "sheet",
@@ -237,11 +237,11 @@ def test_a_point_that_is_clicked_is_held_and_pulled_until_it_is_let_go(scene) ->
         click = looking_down_at(rollout.position[frame][corner])
         session._inspector._click(click, prefers_hand=False)
     wait(client, lambda: client.value("Move") == "point 1")
-    place = object_.take.hands[1].wrist
+    place = object_.motion.hands[1].wrist
     wait(client, lambda: np.allclose(client.positions[GIZMO], place, atol=1e-6))
-    held = object_.take.model.spring_nodes - [0, object_.take.model.node_count]
-    assert [corner, len(object_.take.control) - 1] in held.tolist()
-    assert {hand.name for hand in object_.take.hands} == {"controls", "point 1"}
+    held = object_.motion.model.spring_nodes - [0, object_.motion.model.node_count]
+    assert [corner, len(object_.motion.control) - 1] in held.tolist()
+    assert {hand.name for hand in object_.motion.hands} == {"controls", "point 1"}
     hold(session, "KeyE")
     wait(client, lambda: object_.newest.position[corner, 2] > place[2] + 0.03)
     hold(session)
@@ -249,10 +249,10 @@ def test_a_point_that_is_clicked_is_held_and_pulled_until_it_is_let_go(scene) ->
     press(session, "grip")
     wait(client, lambda: np.allclose(client.positions[GIZMO], start, atol=1e-6))
     wait(client, lambda: object_.newest.position[corner, 2] < place[2] + 0.02)
-    assert [hand.name for hand in object_.take.hands] == ["controls"]
+    assert [hand.name for hand in object_.motion.hands] == ["controls"]
     for count in (2, 2, 1):  # Before it was let go, pulled, and held.
         press(session, "undo")
-        wait(client, lambda count=count: len(object_.take.hands) == count)
+        wait(client, lambda count=count: len(object_.motion.hands) == count)
 
 
 def open_corner(place: np.ndarray) -> int:
@@ -316,7 +316,7 @@ def test_the_fingers_of_a_hand_close_while_a_key_is_held(towel: Session) -> None
         def moved() -> np.ndarray:
             return np.linalg.norm(client.array(HAND, "vertices") - before, axis=1)
 
-        control = object_.take.control_at(object_.newest.pose)
+        control = object_.motion.control_at(object_.newest.pose)
         wait(client, lambda: np.allclose(client.array(HAND, "vertices"), control, atol=1e-5))
         near = np.linalg.norm(before - start, axis=1) < 0.03
         assert near.any()
@@ -349,7 +349,7 @@ def index(towel: Session) -> Iterator[tuple[ViewerClient, SteeredObject, np.ndar
 
 
 def tip_of(object_: SteeredObject) -> np.ndarray:
-    return object_.take.hands[0].tip(1, object_.newest.pose[0])
+    return object_.motion.hands[0].tip(1, object_.newest.pose[0])
 
 
 def test_a_fingertip_follows_the_gizmo_and_its_wrist_stays(towel: Session, index) -> None:
@@ -362,7 +362,7 @@ def test_a_fingertip_follows_the_gizmo_and_its_wrist_stays(towel: Session, index
     np.testing.assert_array_equal(pose[:11], 0.0)  # Wrist, curl and thumb.
     np.testing.assert_array_equal(pose[15:], 0.0)
     # What is drawn, and what holds the object, is the finger that went up.
-    control = object_.take.control_at(object_.newest.pose)
+    control = object_.motion.control_at(object_.newest.pose)
     wait(client, lambda: np.allclose(client.array(HAND, "vertices"), control, atol=1e-5))
     moved = client.array(HAND, "vertices") - before
     nearest = np.argmin(np.linalg.norm(before - joint[8], axis=1))
@@ -409,7 +409,7 @@ def test_a_hand_lets_go_and_grips_what_is_near_it(scene) -> None:
     press(session, "grip")
     wait(client, lambda: any("Nothing to grip" in str(m) for m in client.messages[told:]))
     press(session, "undo")
-    wait(client, lambda: object_.take.holds(0) and client.find("Let go (X)"))
+    wait(client, lambda: object_.motion.holds(0) and client.find("Let go (X)"))
 
 
 def test_the_clock_and_a_user_who_leaves_end_it(scene) -> None:
@@ -474,10 +474,10 @@ def move_both(session: Session, client: ViewerClient) -> None:
     client.set("Move", "both hands")
     wait(client, lambda: session._steer._status.content.count("pulls at the") == 2)
     press(session, "grip")
-    wait(client, lambda: not object_.take.holds(0) and client.find("Grip (X)"))
+    wait(client, lambda: not object_.motion.holds(0) and client.find("Grip (X)"))
     press(session, "undo")
-    wait(client, lambda: object_.take.holds(0) and client.find("Let go (X)"))
-    before, hands = object_.newest.pose, object_.take.hands
+    wait(client, lambda: object_.motion.holds(0) and client.find("Let go (X)"))
+    before, hands = object_.newest.pose, object_.motion.hands
     middle = np.mean([hand.wrist for hand in hands], axis=0)
     wait(client, lambda: np.allclose(client.positions[GIZMO], middle, atol=1e-6))
     press(session, "record")
@@ -491,7 +491,7 @@ def move_both(session: Session, client: ViewerClient) -> None:
     hold(session)
     press(session, "record")
     wait(client, lambda: client.find("Keep"))
-    controls = session._steer._recorded.take.controls()
+    controls = session._steer._recorded.motion.controls()
     for hand in hands:
         assert (controls[-1, hand.control, 2] - controls[0, hand.control, 2]).min() > 0.029
 
@@ -522,7 +522,7 @@ def test_the_other_hand_s_finger_moves_alone_and_both_hands_move_at_once(
         drag(client, target)
 
         def tip() -> np.ndarray:
-            return object_.take.hands[1].tip(1, object_.newest.pose[1])
+            return object_.motion.hands[1].tip(1, object_.newest.pose[1])
 
         wait(client, lambda: np.allclose(tip(), target, atol=2e-6))
         moved = object_.newest.pose[1]

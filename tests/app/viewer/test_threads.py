@@ -16,6 +16,7 @@ import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, hear_all, rest_at
 from waiting import LIMIT_S as PATIENCE
+from waiting import WatchedLock, until
 
 from app.viewer.compare.camera import Eye
 from app.viewer.content.content import Content
@@ -24,9 +25,6 @@ from app.viewer.live.wire import Message
 from app.viewer.physics.history import TriedSetting
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
-
-SHORT = 0.3
-"""For how long one thread waits for another one that may have to wait for it."""
 
 
 @contextmanager
@@ -42,6 +40,11 @@ def beside(act: Callable[[], Any]) -> threading.Thread:
     thread = threading.Thread(target=act)
     thread.start()
     return thread
+
+
+def until_it_waits(thread: threading.Thread, lock: WatchedLock) -> None:
+    """Wait until a thread waits for a lock, or has ended without it."""
+    until(lambda: thread.ident in lock.waiting or not thread.is_alive())
 
 
 def write_all(session: Session) -> None:
@@ -131,13 +134,15 @@ def test_the_errors_are_those_of_the_rollout_that_was_read_last(
         old, new = object(), object()
         followed: list[object] = []
         has_begun, is_past = threading.Event(), threading.Event()
+        lock, newer = WatchedLock(), threading.get_ident()
 
-        def follow(take: object, *, at_once: bool) -> None:
-            if take is old:
+        def follow(rollout: object, *, at_once: bool) -> None:
+            if rollout is old:
                 has_begun.set()
-                is_past.wait(SHORT)
-            followed.append(take)
+                until(lambda: is_past.is_set() or newer in lock.waiting)
+            followed.append(rollout)
 
+        monkeypatch.setattr(simulated, "_lock", lock)
         monkeypatch.setattr(simulated._errors, "follow", follow)
         monkeypatch.setattr(simulated, "_show_readout", lambda **_: simulated._rollouts.readout)
         rollouts = type(simulated._rollouts)
@@ -199,7 +204,7 @@ class SlowRollouts:
         assert edits == ()
         if not self.has_begun.is_set():
             self.has_begun.set()
-            self.may_end.wait(SHORT)
+            assert self.may_end.wait(PATIENCE)
         self.asked.append(parameters)
 
 
@@ -207,7 +212,7 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
     with watched(sessions) as (session, _):
         assert session._object is not None
         panel, rollouts = session._object.panel, SlowRollouts(session)
-        panel._rollouts = rollouts
+        panel._rollouts, panel._lock = rollouts, WatchedLock()
         controls = {knob.field: (knob, control) for knob, control in panel._sliders._controls}
         knob, control = controls["drag"]
         control.handle._impl.value = 7.0
@@ -223,6 +228,8 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
             beside(lambda: panel._change(substeps)),
             beside(lambda: panel._move(knob, control, 1)),
         ]
+        for thread in others:
+            until_it_waits(thread, panel._lock)
         rollouts.may_end.set()
         for thread in (first, *others):
             thread.join(PATIENCE)
@@ -244,13 +251,14 @@ def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
         aimed: list[object] = []
         monkeypatch.setattr(comparison._view, "_aim", lambda client, _: aimed.append(client))
         monkeypatch.setattr(comparison._cameras, "has_lost", lambda _: True)
+        monkeypatch.setattr(comparison, "_lock", WatchedLock())
         comparison.turn(viewer)
         # The browser's own answers to being aimed may be among them.
         assert viewer in aimed
         with comparison._lock:
             aimed.clear()
             late = beside(lambda: comparison.turn(viewer))
-            late.join(SHORT)
+            until_it_waits(late, comparison._lock)
             comparison._leave()
         late.join(PATIENCE)
         assert aimed == []
@@ -289,8 +297,10 @@ def test_a_parameter_to_be_put_back_is_not_forgotten_before_it_is_heard(
 def test_what_is_sent_again_to_a_new_process_comes_before_what_is_newer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    live = SimulationClient("cpu")
+    live, lock = SimulationClient("cpu"), WatchedLock()
     monkeypatch.setattr(live, "start", lambda: None)
+    monkeypatch.setattr(live, "_lock", lock)
+    monkeypatch.setattr(live, "_wake", SimpleNamespace(notify_all=lambda: None))
     request = LiveRequest(run=tmp_path, sequence="lift", parameters=PARAMETERS)
     live.hold("a", on=True)
     live.request("a", request)
@@ -306,7 +316,7 @@ def test_what_is_sent_again_to_a_new_process_comes_before_what_is_newer(
                 lambda: live.request("a", replace(request, sequence="drag")),
             ):
                 threads.append(beside(act))
-                threads[-1].join(SHORT)  # It would overtake the message if it could.
+                until_it_waits(threads[-1], lock)  # It would overtake the message if it could.
         arrived.append(message)
 
     monkeypatch.setattr(live, "_write", write)

@@ -20,13 +20,13 @@ from physhandi.pipeline import run_job
 from physhandi.run import Run
 from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 from physhandi.simulation.fingers import CURLS, Fingers
-from physhandi.simulation.steering import POSE, HandSurface, SteeredHand, Take
+from physhandi.simulation.steering import POSE, HandSurface, SteeredHand, SteeredMotion
 
 AT, FRAMES = 20, 4
 TOWEL = BUNDLED / "runs" / "towel_fold_quick"
 
 
-def taken() -> Take:
+def taken() -> SteeredMotion:
     """The bundled towel, whose hand goes up and turns by 0.6 rad in three frames."""
     rollout = FittedObject.of(TOWEL).fitted
     model, start = rollout.going_on(AT)
@@ -36,7 +36,7 @@ def taken() -> Take:
         name="right", control=np.arange(len(control)), wrist=joints[AT, 0].astype(np.float64)
     )
     pose = np.linspace(0, 1, FRAMES)[:, None, None] * [[0.0, 0.0, 0.02, 0.6, *np.zeros(POSE - 4)]]
-    return Take(
+    return SteeredMotion(
         model=model,
         start=start,
         parameters=rollout.parameters,
@@ -46,7 +46,7 @@ def taken() -> Take:
     )
 
 
-def run_of(take: Take, folder: Path) -> Run:
+def run_of(take: SteeredMotion, folder: Path) -> Run:
     """Run what was steered as a user's worker does."""
     stored = StoredTake(take=take, sequence="towel_fold", frame=AT)
     run = Run.create(

@@ -27,7 +27,7 @@ from physhandi.simulation.edits import (
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.rod import Rod
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.steering import POSE, SteeredHand, Take
+from physhandi.simulation.steering import POSE, SteeredHand, SteeredMotion
 
 STIFFNESS, VIRTUAL, DAMPING, FLOOR = 30.0, 45.0, 1.5, 0.004
 """What springs get that are added."""
@@ -190,7 +190,7 @@ def test_pins_stay_where_they_are_whatever_hand_is_steered() -> None:
     control = after.with_pins(scene.control.astype(np.float32))[0]
     moving = np.arange(after.control_count - after.pin_count)
     hand = SteeredHand(name="right", control=moving, wrist=np.zeros(3))
-    take = Take(
+    motion = SteeredMotion(
         model=after,
         start=(after.object_node, after.initial_velocity),
         parameters=parameters,
@@ -198,11 +198,11 @@ def test_pins_stay_where_they_are_whatever_hand_is_steered() -> None:
         hands=(hand,),
         pose=0.1 * np.eye(POSE)[:1] * [[[0.0]], [[1.0]]],
     )
-    moved = take.controls()[1] - control
+    moved = motion.controls()[1] - control
     np.testing.assert_allclose(moved[:4], np.tile([[0.1, 0, 0]], (4, 1)), atol=1e-7)
     np.testing.assert_array_equal(moved[4:], 0.0)
-    again = Take.from_tensors(take.to_tensors(), parameters)
-    np.testing.assert_array_equal(again.controls(), take.controls())
+    again = SteeredMotion.from_tensors(motion.to_tensors(), parameters)
+    np.testing.assert_array_equal(again.controls(), motion.controls())
 
 
 def test_edits_are_stored_and_read_as_they_were() -> None:

@@ -12,8 +12,8 @@ from physhandi.simulation.fingers import BENDS, CURLS, Fingers
 from physhandi.simulation.steering import (
     POSE,
     SteeredHand,
+    SteeredMotion,
     SteeredSimulation,
-    Take,
     from_quaternion,
     nearest_surface,
     to_quaternion,
@@ -35,7 +35,7 @@ def rotation(axis: int, angle: float) -> np.ndarray:
     }[axis]
 
 
-def steered_cube(frames: int = FRAMES) -> Take:
+def steered_cube(frames: int = FRAMES) -> SteeredMotion:
     """The cube whose controls 0 to 2 follow one hand, and control 3 another one that rests."""
     scene = cube_scene()
     model, parameters = as_model(scene)
@@ -48,7 +48,7 @@ def steered_cube(frames: int = FRAMES) -> Take:
         SteeredHand(name="left", control=np.array([3]), wrist=np.zeros(3)),
     )
     control = scene.control[0].astype(np.float32)
-    return Take(
+    return SteeredMotion(
         model=model,
         start=(model.object_node, model.initial_velocity),
         parameters=parameters,
@@ -59,16 +59,16 @@ def steered_cube(frames: int = FRAMES) -> Take:
 
 
 def test_a_steered_hand_moves_the_object_as_the_oracle_says(device: str) -> None:
-    take, scene = steered_cube(), cube_scene()
+    motion, scene = steered_cube(), cube_scene()
     control = np.repeat(scene.control[:1], FRAMES, axis=0)
     for frame in range(FRAMES):
         part = frame / (FRAMES - 1)
-        turn, wrist = rotation(2, 0.3 * part), take.hands[0].wrist
+        turn, wrist = rotation(2, 0.3 * part), motion.hands[0].wrist
         at = wrist + part * np.array([0.004, -0.002, 0.006])
         control[frame, :3] = [turn @ (point - wrist) + at for point in scene.control[0, :3]]
-    np.testing.assert_allclose(take.controls(), control, atol=1e-8)
+    np.testing.assert_allclose(motion.controls(), control, atol=1e-8)
     expected = simulate(replace(scene, control=control))[0]
-    found = np.stack([position for position, _ in take.simulate(device)])
+    found = np.stack([position for position, _ in motion.simulate(device)])
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert (
         np.abs(found - simulate(replace(scene, control=control[:1].repeat(6, 0)))[0]).max() > 1e-3
@@ -76,32 +76,32 @@ def test_a_steered_hand_moves_the_object_as_the_oracle_says(device: str) -> None
 
 
 def test_the_same_take_gives_the_same_bits_from_any_of_its_frames_on() -> None:
-    take = steered_cube()
-    frames = list(take.simulate())
+    motion = steered_cube()
+    frames = list(motion.simulate())
     for first, last in ((0, 5), (2, 5), (3, 4)):
-        part = take.part(first, last, frames[first])
+        part = motion.part(first, last, frames[first])
         again = list(part.simulate())
         assert len(again) == last - first + 1
         for old, new in zip(frames[first:], again, strict=False):
             np.testing.assert_array_equal(old, new)
-    steered = SteeredSimulation(take)
-    for pose, expected in zip(take.pose[1:], frames[1:], strict=True):
+    steered = SteeredSimulation(motion)
+    for pose, expected in zip(motion.pose[1:], frames[1:], strict=True):
         np.testing.assert_array_equal(steered.step(pose), expected)
     assert steered.frame == 5
 
 
 def test_fingers_move_control_nodes_between_the_shapes_that_are_known() -> None:
-    take = steered_cube()
-    own = take.control[[0, 1, 2]]
+    motion = steered_cube()
+    own = motion.control[[0, 1, 2]]
     # Of the three nodes the second goes along x with the curl, and the third by its square.
     shapes = np.repeat(own[None], len(CURLS), axis=0)
     shapes[:, 1, 0] += np.float32(0.01) * CURLS.astype(np.float32)
     shapes[:, 2, 0] += np.float32(0.01) * CURLS.astype(np.float32) ** 2
-    right = replace(take.hands[0], curls=shapes)
+    right = replace(motion.hands[0], curls=shapes)
     pose = np.zeros((4, 2, POSE))
     pose[:, 0, 6] = [0.0, 0.3, 1.0, -1.0]
-    closing = replace(take, hands=(right, take.hands[1]), pose=pose)
-    moved = closing.controls() - take.control
+    closing = replace(motion, hands=(right, motion.hands[1]), pose=pose)
+    moved = closing.controls() - motion.control
     np.testing.assert_array_equal(moved[0], 0.0)
     np.testing.assert_allclose(moved[:, 1, 0], [0.0, 0.003, 0.01, -0.01], atol=1e-8)
     low, high = 0.25**2, 0.375**2
@@ -109,23 +109,23 @@ def test_fingers_move_control_nodes_between_the_shapes_that_are_known() -> None:
         moved[:, 2, 0], [0.0, 0.01 * (low + 0.4 * (high - low)), 0.01, 0.01], atol=1e-8
     )
     np.testing.assert_array_equal(moved[:, [0, 3]], 0.0)
-    again = Take.from_tensors(closing.to_tensors(), closing.parameters)
+    again = SteeredMotion.from_tensors(closing.to_tensors(), closing.parameters)
     np.testing.assert_array_equal(again.controls(), closing.controls())
     with pytest.raises(ValueError, match="curls of right has shape"):
-        replace(take, hands=(replace(right, curls=shapes[1:]), take.hands[1]))
+        replace(motion, hands=(replace(right, curls=shapes[1:]), motion.hands[1]))
     # Where fingers are turned in the same way, the wrist takes them along.
     pose[2, 0, 3:6] = [0.0, 0.0, np.pi / 2]
-    turned = closing.control_at(pose[2])[1] - take.hands[0].wrist
-    still = take.control[1] + [0.01, 0, 0] - take.hands[0].wrist
+    turned = closing.control_at(pose[2])[1] - motion.hands[0].wrist
+    still = motion.control[1] + [0.01, 0, 0] - motion.hands[0].wrist
     np.testing.assert_allclose(turned, [-still[1], still[0], still[2]], atol=1e-7)
 
 
-def fingers_of_cube(take: Take) -> Fingers:
+def fingers_of_cube(motion: SteeredMotion) -> Fingers:
     """Fingers along x, which bend about y and swing about z; node 1 hangs on the first, at its end.
 
     All five begin at the wrist of the first hand; their joints are 0, 1 and 2 cm from it.
     """
-    wrist = take.hands[0].wrist
+    wrist = motion.hands[0].wrist
     origin = np.tile(wrist + 0.01 * np.eye(3)[[0]] * [[0], [1], [2]], (len(CURLS), 5, 1))
     weight = np.zeros((3, 15))
     weight[1, 2] = 1.0
@@ -142,24 +142,24 @@ def fingers_of_cube(take: Take) -> Fingers:
 
 
 def test_a_finger_takes_its_control_nodes_along_and_the_wrist_takes_all() -> None:
-    take = steered_cube()
-    own = take.control[[0, 1, 2]]
+    motion = steered_cube()
+    own = motion.control[[0, 1, 2]]
     shapes = np.repeat(own[None], len(CURLS), axis=0)
-    shapes[:, 1] = take.hands[0].wrist + AHEAD
-    right = replace(take.hands[0], curls=shapes, fingers=fingers_of_cube(take))
-    hands = (right, take.hands[1])
+    shapes[:, 1] = motion.hands[0].wrist + AHEAD
+    right = replace(motion.hands[0], curls=shapes, fingers=fingers_of_cube(motion))
+    hands = (right, motion.hands[1])
     pose = np.zeros((3, 2, POSE))
     pose[1, 0, 7:11] = [0.0, 0.0, np.pi / 2, 0.0]  # The middle joint of the first finger.
     pose[2] = pose[1]
     pose[2, 0, 7] = np.pi / 2  # It swings, too, and the hand turns about x and goes up.
     pose[2, 0, 3:6] = [np.pi / 2, 0.0, 0.0]
     pose[2, 0, 2] = 0.005
-    take = replace(take, hands=hands, pose=pose)
+    motion = replace(motion, hands=hands, pose=pose)
     wrist = right.wrist
-    moved = np.stack([take.control_at(its)[1] for its in pose]) - wrist
+    moved = np.stack([motion.control_at(its)[1] for its in pose]) - wrist
     expected = [[0.03, 0, 0], [0.01, 0, -0.02], [0.0, 0.02, 0.01 + 0.005]]
     np.testing.assert_allclose(moved, expected, atol=1e-7)
-    np.testing.assert_array_equal(take.control_at(pose[1])[[0, 2, 3]], take.control[[0, 2, 3]])
+    np.testing.assert_array_equal(motion.control_at(pose[1])[[0, 2, 3]], motion.control[[0, 2, 3]])
     np.testing.assert_allclose(right.tip(0, pose[2, 0]) - wrist, expected[2], atol=1e-12)
     np.testing.assert_allclose(right.tip(1, pose[2, 0]) - wrist, [0.03, 0, 0.005], atol=1e-12)
 
@@ -171,51 +171,53 @@ def test_a_finger_takes_its_control_nodes_along_and_the_wrist_takes_all() -> Non
         np.testing.assert_allclose(right.tip(0, there) - wrist, place, atol=1e-6)
         np.testing.assert_array_equal(bend[4:], start[11:])
     with pytest.raises(UsageError, match="left has no fingers that bend"):
-        take.hands[1].follow(0, wrist, pose[0, 1])
+        motion.hands[1].follow(0, wrist, pose[0, 1])
     with pytest.raises(UsageError, match="finite"):
         right.follow(0, np.full(3, np.nan), pose[0, 0])
     with pytest.raises(ValueError, match="fingers of right move 2 points; expected one for each"):
-        replace(take, hands=(replace(right, fingers=right.fingers.of_points([0, 1])), hands[1]))
+        replace(motion, hands=(replace(right, fingers=right.fingers.of_points([0, 1])), hands[1]))
 
-    again = Take.from_tensors(take.to_tensors(), take.parameters)
-    np.testing.assert_array_equal(again.controls(), take.controls())
-    smooth = replace(take, pose=np.repeat(pose[1:2], 5, axis=0)).smoothed(0.1)
+    again = SteeredMotion.from_tensors(motion.to_tensors(), motion.parameters)
+    np.testing.assert_array_equal(again.controls(), motion.controls())
+    smooth = replace(motion, pose=np.repeat(pose[1:2], 5, axis=0)).smoothed(0.1)
     np.testing.assert_allclose(smooth.pose[:, 0], np.tile(pose[1, 0], (5, 1)), atol=1e-12)
 
 
 def test_a_take_of_before_fingers_bent_one_by_one_opens() -> None:
-    take = steered_cube()
-    tensors = take.to_tensors()
-    old = Take.from_tensors({**tensors, "pose": tensors["pose"][..., :7]}, take.parameters)
-    np.testing.assert_array_equal(old.pose, take.pose)
-    np.testing.assert_array_equal(old.controls(), take.controls())
+    motion = steered_cube()
+    tensors = motion.to_tensors()
+    old = SteeredMotion.from_tensors(
+        {**tensors, "pose": tensors["pose"][..., :7]}, motion.parameters
+    )
+    np.testing.assert_array_equal(old.pose, motion.pose)
+    np.testing.assert_array_equal(old.controls(), motion.controls())
 
 
 def test_a_take_is_stored_with_every_bit() -> None:
-    take = steered_cube()
-    again = Take.from_tensors(take.to_tensors(), take.parameters)
-    np.testing.assert_array_equal(again.controls(), take.controls())
+    motion = steered_cube()
+    again = SteeredMotion.from_tensors(motion.to_tensors(), motion.parameters)
+    np.testing.assert_array_equal(again.controls(), motion.controls())
     assert [hand.name for hand in again.hands] == ["right", "left"]
     assert [hand.control.tolist() for hand in again.hands] == [[0, 1, 2], [3]]
-    for old, new in zip(take.simulate(), again.simulate(), strict=True):
+    for old, new in zip(motion.simulate(), again.simulate(), strict=True):
         np.testing.assert_array_equal(old, new)
 
 
 def test_smoothing_takes_jitter_out_and_leaves_straight_ways_and_the_start() -> None:
-    take = steered_cube(60)
+    motion = steered_cube(60)
     rng = np.random.default_rng(2)
-    jitter = take.pose + rng.normal(0.0, 0.002, take.pose.shape)
-    smooth = replace(take, pose=jitter).smoothed(0.1).pose
+    jitter = motion.pose + rng.normal(0.0, 0.002, motion.pose.shape)
+    smooth = replace(motion, pose=jitter).smoothed(0.1).pose
     np.testing.assert_array_equal(smooth[0], jitter[0])
     middle = slice(12, 48)  # At the last frame there is nothing to average with.
-    left = np.abs(smooth - take.pose)[middle].std() / np.abs(jitter - take.pose)[middle].std()
+    left = np.abs(smooth - motion.pose)[middle].std() / np.abs(jitter - motion.pose)[middle].std()
     assert 0.2 < left < 0.6  # A Gaussian of three frames keeps 0.31 of white noise.
-    np.testing.assert_allclose(take.smoothed(0.1).pose[middle], take.pose[middle], atol=2e-5)
-    assert take.smoothed(0.0) is take
+    np.testing.assert_allclose(motion.smoothed(0.1).pose[middle], motion.pose[middle], atol=2e-5)
+    assert motion.smoothed(0.0) is motion
     # A hand that turns beyond half a turn does not spin back.
     pose = np.zeros((60, 2, POSE))
     pose[:, 0, 5] = (np.linspace(0, 1.5 * np.pi, 60) + np.pi) % (2 * np.pi) - np.pi
-    steps = np.diff(np.unwrap(replace(take, pose=pose).smoothed(0.1).pose[:, 0, 5]))
+    steps = np.diff(np.unwrap(replace(motion, pose=pose).smoothed(0.1).pose[:, 0, 5]))
     assert 0.0 < steps.min() <= steps.max() < 0.1
 
 
@@ -234,17 +236,17 @@ def test_what_does_not_fit_is_refused(change, message: str) -> None:
 
 
 def test_hands_of_the_same_or_unknown_control_nodes_are_refused() -> None:
-    take = steered_cube()
+    motion = steered_cube()
     for numbers in ([0, 0], [4], [-1]):
         hand = SteeredHand(name="right", control=np.array(numbers), wrist=np.zeros(3))
         with pytest.raises(ValueError, match="must name different control nodes"):
-            replace(take, hands=(hand,), pose=np.zeros((1, 1, POSE)))
+            replace(motion, hands=(hand,), pose=np.zeros((1, 1, POSE)))
     with pytest.raises(ValueError, match="frames 3 to 6 are not among the 6"):
-        take.part(3, 6, next(take.simulate()))
-    tensors = take.to_tensors()
+        motion.part(3, 6, next(motion.simulate()))
+    tensors = motion.to_tensors()
     del tensors["wrist"]
     with pytest.raises(ValueError, match="A take needs the arrays"):
-        Take.from_tensors(tensors, take.parameters)
+        SteeredMotion.from_tensors(tensors, motion.parameters)
 
 
 def test_rotations_follow_one_another_about_the_axes_of_the_world() -> None:
