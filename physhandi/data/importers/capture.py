@@ -166,7 +166,8 @@ def import_capture(
             Record3D's ``.r3d`` (docs/your-data.md).
         out_folder: Folder of the new sequence; its last part names the sequence.
         progress: Receives a report after every image; may cancel. The same call then goes on where
-            it was stopped, or killed, unless the recording or an option was changed.
+            it was stopped, or killed, unless the recording, its calibration or an option was
+            changed.
         options: What the recording does not say itself.
         overwrite: Whether to replace a sequence that is there.
         keeps_same: Whether one that is there is taken as it is if it was made of the same recording
@@ -194,7 +195,7 @@ def import_capture(
         _check_images(views, paired)
         _check_board_pictures(source, views, _board(source, views, options))
         sources, notes = _sources(views, paired, options)
-        origin = _origin(given, sources, options)
+        origin = _origin(source, given, sources, paired, options)
         if keeps_same and not overwrite and _is_made_of(Path(out_folder), origin):
             return sequences.Sequence.load(out_folder)
         placement = _place(source, sources, options, paired.count)
@@ -242,26 +243,40 @@ def _is_made_of(folder: Path, origin: str) -> bool:
         return False
 
 
-def _origin(given: Path, sources: list[_Source], options: CaptureOptions) -> str:
-    """Name all that images are made from: files, lenses, scales and the choice of frames."""
-    digest = hashlib.sha256(repr((physhandi.__version__, options)).encode())
-    for source in sources:
-        view = source.view
+def _origin(
+    source: Path,
+    given: Path,
+    sources: list[_Source],
+    paired: PairedFrames,
+    options: CaptureOptions,
+) -> str:
+    """Name all that a sequence is made from: files, lenses, poses, scales, times and frames."""
+    views = [one.view for one in sources]
+    target = _board(source, views, options)
+    digest = hashlib.sha256(
+        repr((physhandi.__version__, options, target, paired.frame_rate)).encode()
+    )
+    for one in sources:
+        view = one.view
         lenses = [view.camera, *([view.depth_camera] if view.depth_camera is not None else [])]
-        arrays = [lens.K for lens in lenses] + [lens.distortion for lens in lenses]
-        arrays += [
-            one for one in (view.T_color_depth, source.color, source.depth) if one is not None
+        arrays = [
+            *(lens.K for lens in lenses),
+            *(lens.distortion for lens in lenses),
+            *(view.T_color_depth, view.T_world_camera, one.color, one.depth),
         ]
-        digest.update(repr((view.name, view.size, source.scale, len(arrays))).encode())
+        shapes = [None if array is None else array.shape for array in arrays]
+        models = [lens.model for lens in lenses]
+        digest.update(repr((view.name, view.size, one.scale, models, shapes)).encode())
         for array in arrays:
-            digest.update(np.ascontiguousarray(array).tobytes())
+            if array is not None:
+                digest.update(np.ascontiguousarray(array).tobytes())
     # Bags are unpacked anew each time, so they stand for their images.
     files = find_bags(given) or [
-        file
-        for source in sources
-        for stream in source.view.streams
-        for file in stream.files or (stream.path,)
+        file for view in views for stream in view.streams for file in stream.files or (stream.path,)
     ]
+    for view in views if target is not None else ():
+        pictures = _board_pictures(source, view, is_alone=len(views) == 1) or ()
+        files += [path.resolve() for path in pictures]
     for file in files:
         for path in [file] if file.is_file() else sorted(file.rglob("*")):
             status = path.stat()

@@ -4,6 +4,7 @@ import json
 import os
 import pickle
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from physhandi.data.importers.board_calibration import AprilGrid, CharucoTarget,
 from physhandi.data.importers.capture import CaptureOptions, import_capture, survey_capture
 from physhandi.data.importers.recorded_camera import RecordedCamera, read_camera
 from physhandi.data.importers.rectification import Rectifier
-from physhandi.errors import CancelledError, ImportFailedError, UsageError
+from physhandi.errors import CancelledError, ImportFailedError, SequenceError, UsageError
 from physhandi.progress import Progress
 
 
@@ -579,6 +580,48 @@ def test_what_a_stopped_import_left_is_only_trusted_if_nothing_changed(raw, tmp_
         assert np.array_equal(sequence.views[0].color(frame), color)
         assert np.abs(sequence.views[0].depth(frame) - depth).max() < 6e-4
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_sequence_that_is_there_is_taken_only_if_its_calibration_is_the_same(tmp_path):
+    raw = RawCapture(tmp_path / "raw").write(2, times=True)
+    raw.table("left", distortion=[1e-4, 0, 0, 0])
+    made = import_capture(raw.folder, tmp_path / "out")
+    table = (raw.folder / "left/intrinsics.json").read_text()
+
+    def is_refused() -> None:
+        with pytest.raises(SequenceError, match="exists already"):
+            import_capture(raw.folder, made.folder, keeps_same=True)
+        (raw.folder / "left/intrinsics.json").write_text(table)
+        taken = import_capture(raw.folder, made.folder, keeps_same=True)
+        assert taken.provenance == made.provenance
+
+    raw.table("left", T_world_camera=camera_at(30.05).T_world_camera.tolist())
+    is_refused()
+    raw.table("left", distortion_model="fisheye")
+    is_refused()
+    for view in raw.cameras:
+        (raw.folder / view / "timestamps.txt").write_text("100.0\n100.04\n")
+    with pytest.raises(SequenceError, match="exists already"):
+        import_capture(raw.folder, made.folder, keeps_same=True)
+
+
+def test_a_sequence_that_is_there_is_taken_only_if_the_board_was_the_same(tmp_path):
+    cameras = {name: camera_at(at, scale=4) for name, at in (("left", 30), ("right", 110))}
+    raw = RawCapture(tmp_path / "raw", cameras).write(2, poses=False)
+    raw.photograph_board()
+    board = raw.folder / "calibration/board.json"
+    photograph = raw.folder / "calibration/left/00000.png"
+    board.write_text('{"charuco": "7x5,0.04"}')
+    os.utime(photograph, (2, 2))
+    import_capture(raw.folder, tmp_path / "out")
+    board.write_text('{"charuco": "7x5,0.0401"}')
+    with pytest.raises(SequenceError, match="exists already"):
+        import_capture(raw.folder, tmp_path / "out", keeps_same=True)
+    board.write_text('{"charuco": "7x5,0.04"}')
+    import_capture(raw.folder, tmp_path / "out", keeps_same=True)
+    os.utime(photograph, (1, 1))
+    with pytest.raises(SequenceError, match="exists already"):
+        import_capture(raw.folder, tmp_path / "out", keeps_same=True)
 
 
 def test_a_failed_import_leaves_nothing(raw, tmp_path):
