@@ -2,6 +2,8 @@
 
 KNOWN_SCALES = (1.0, 0.01, 0.001, 0.00025, 0.0002, 0.0001)
 """Metres, centimetres, millimetres, RealSense L515, TUM, tenths of millimetres [m]."""
+LARGEST_SCALE = 1.0
+"""Largest scale that can be given; a number above it counts as units per metre [m]."""
 _NEAR = 1.4
 
 

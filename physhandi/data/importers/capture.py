@@ -16,7 +16,7 @@ from numpy import ndarray
 import physhandi
 from physhandi.data import sequence as sequences
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.depth_scale import KNOWN_SCALES
+from physhandi.data.depth_scale import KNOWN_SCALES, LARGEST_SCALE
 from physhandi.data.files import temporary_name
 from physhandi.data.importers.bag import find_bags, unpack_bags
 from physhandi.data.importers.board_calibration import (
@@ -525,7 +525,7 @@ def _depth_scale(
         scale = 0.001 if not is_float or median > 20 else 1.0
         unit = "millimetres" if scale == 0.001 else "metres"
         notes.append(f"Nothing tells the unit of depth, so it is taken for {unit}.")
-    elif scale > 1.0:
+    elif scale > LARGEST_SCALE:
         scale = 1.0 / scale
     if not low <= scale * median <= high:
         fits = [f"{s:g}" for s in KNOWN_SCALES if _NEAREST <= s * median <= _FARTHEST]
@@ -825,11 +825,16 @@ def _check_table(
         # No lens is off by more, but two may be exchanged.
         is_lens = _WRONG_LENS[0] < ratio < _WRONG_LENS[1]
         other = ", unless its intrinsics are those of another camera (were two exchanged?)"
+        right = source.scale / ratio
+        remedy = (
+            f"give --depth-scale {right:.2g}"
+            if right <= LARGEST_SCALE
+            else f"multiply its images by {1 / ratio:.2g}"
+        )
         fail(
             source.view.folder if source.view.depth is None else source.view.depth.path,
             f"puts the table {ratio:.3g} times as far from the camera as the board says. The depth "
-            f"scale is not {source.scale:g}; give --depth-scale {source.scale / ratio:.2g}"
-            f"{other if is_lens else ''}",
+            f"scale is not {source.scale:g}; {remedy}{other if is_lens else ''}",
         )
     if not _RATIO[0] <= ratio <= _RATIO[1]:
         notes.append(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 from numpy import ndarray
 
-from physhandi.data.depth_scale import likely_scales
+from physhandi.data.depth_scale import LARGEST_SCALE, likely_scales
 from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
@@ -50,6 +50,9 @@ FEW_PIXELS = 20
 """Labelled pixels with depth below which a frame does not show a thing."""
 MUCH_LOST = 0.5
 """Share of the object's pixels without depth from which a frame is doubted."""
+
+_PALMS_STORED = (1e-4, 1e3)
+"""Lengths of palms that some scale of depth may have led to; others are no measurement [m]."""
 
 Level = Literal["error", "warning"]
 
@@ -175,16 +178,19 @@ def depth_scale_problems(sequence: Sequence) -> list[Problem]:
             continue
         keypoint = view.keypoint
         palm: Any = detected.get(view.name) if keypoint is None else palm_length(view, keypoint)
-        if isinstance(palm, float) and palm > 0 and is_impossible_palm(palm):
+        is_length = isinstance(palm, float) and _PALMS_STORED[0] < palm < _PALMS_STORED[1]
+        if is_length and is_impossible_palm(palm):
             problems.append(_wrong_scale(view, palm, scales.get(view.name)))
     return problems
 
 
 def _wrong_scale(view: View, length: float, scale: Any) -> Problem:
     ratio = length / PALM_LENGTH
-    if isinstance(scale, float) and scale > 0:
-        right = " or ".join(f"{one:g}" for one in likely_scales(scale / ratio))
-        remedy = f"import it again with --depth-scale {right}, in the place of {scale:g}"
+    right = scale / ratio if isinstance(scale, float) else 0.0
+    likely = [one for one in likely_scales(right) if one <= LARGEST_SCALE] if right > 0 else []
+    if likely:
+        choice = " or ".join(f"{one:g}" for one in likely)
+        remedy = f"import it again with --depth-scale {choice}, in the place of {scale:g}"
     else:
         remedy = f"multiply its depth images by {1 / ratio:.2g}"
     low, high = (100 * end for end in PALM_LENGTHS)

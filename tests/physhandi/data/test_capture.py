@@ -4,7 +4,6 @@ import json
 import os
 import pickle
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -403,6 +402,12 @@ def test_the_board_of_the_first_frames_calibrates_too_and_tells_a_wrong_depth_sc
             tmp_path / "wrong",
             options=CaptureOptions(board=BOARD, depth_scale=0.002),
         )
+    for path in (raw.folder / "only/depth").glob("*.png"):  # Metres would be a scale of 2.
+        halves = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) / 2000
+        np.save(path.with_suffix(".npy"), halves)
+        path.unlink()
+    with pytest.raises(ImportFailedError, match=r"0\.5 times as far.* multiply its images by 2\b"):
+        import_capture(raw.folder, tmp_path / "wrong", options=options)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from clicked_disc import disc_click, write_disc
 import physhandi as ph
 from physhandi.data.depth_scale import likely_scales
 from physhandi.data.sequence import Sequence
+from physhandi.fitting.checks.recording_check import depth_scale_problems
 from physhandi.perception import annotation, segmentation
 from physhandi.perception.annotation import annotate
 from physhandi.perception.hand_size import is_impossible_palm, palm_length
@@ -67,13 +68,31 @@ def test_a_wrong_scale_is_named_with_the_likely_one(towel, factor, scale, right)
     assert f"--depth-scale {right}, in the place of {scale:g}" in problem.remedy
 
 
-def test_a_scale_that_nobody_noted_is_told_as_a_factor(towel):
-    scaled(towel, 5.0)
-    text = (towel / "sequence.yaml").read_text()
-    (towel / "sequence.yaml").write_text(text.partition("\nprovenance:")[0] + "\n")
-    found = [line for line in told(towel) if "wrist to knuckles" in line]
-    assert len(found) == 3
-    assert all("multiply its depth images by 0.2" in line for line in found)
+@pytest.mark.parametrize("scale", [None, 1.0])
+def test_a_scale_that_nobody_noted_or_that_cannot_be_given_is_told_as_a_factor(towel, scale):
+    """Above 1, a scale would be taken for units per metre: 5 for a fifth."""
+    factor = 5.0 if scale is None else 0.2
+    scaled(towel, factor)
+    if scale is None:
+        text = (towel / "sequence.yaml").read_text()
+        (towel / "sequence.yaml").write_text(text.partition("\nprovenance:")[0] + "\n")
+    else:
+        imported_with(towel, scale)
+    remedies = [one.remedy for one in depth_scale_problems(Sequence.load(towel))]
+    factors = [float(one.partition("multiply its depth images by ")[2]) for one in remedies]
+    assert factors == pytest.approx([1.22 / factor] * 3, rel=0.1)  # Its palms are 7 of 8.5 cm.
+
+
+@pytest.mark.parametrize(
+    ("palm", "scale"), [("1.0e-300", "0.001"), ("0.42", "1.0e-323"), ("[]", "x")]
+)
+def test_figures_that_nobody_can_have_measured_do_no_harm(towel, palm, scale):
+    (towel / "views/front/keypoint.npy").unlink()
+    text = (towel / "sequence.yaml").read_text().partition("\nprovenance:")[0]
+    provenance = f"  palm_length: {{front: {palm}}}\n  depth_scale: {{front: {scale}}}\n"
+    (towel / "sequence.yaml").write_text(f"{text}\nprovenance:\n{provenance}")
+    remedies = [one.remedy for one in depth_scale_problems(Sequence.load(towel))]
+    assert remedies == (["multiply its depth images by 0.2"] if palm == "0.42" else [])
 
 
 @pytest.mark.parametrize("lost", ["file", "hand", "depth", "metres"])
