@@ -84,6 +84,11 @@ def written(rel: str, content: bytes) -> Damage:
     return lambda raw: (raw.folder / rel).write_bytes(content)
 
 
+def renamed_array(path: Path) -> None:
+    with path.open("wb") as stream:
+        np.save(stream, np.zeros((72, 96, 3), np.uint8))
+
+
 def painted_exr(raw: RawCapture) -> None:
     color = picture(CAMERAS["left"], 4)[0].astype(np.float32)
     OpenEXR.File({}, {"RGB": color}).write(str(raw.folder / "left/depth/00004.exr"))
@@ -250,6 +255,14 @@ REFUSED: dict[str, tuple[Damage, tuple[str, ...]]] = {
         ),
         ("depth/00005.npy", "whole .npy"),
     ),
+    "an array called .png": (
+        lambda raw: renamed_array(raw.folder / "left/color/00004.png"),
+        ("color/00004.png", "holds .npy in spite of its name"),
+    ),
+    "OpenEXR called .png": (
+        written("left/color/00004.png", exr(96, 72)),
+        ("color/00004.png", "holds OpenEXR in spite of its name"),
+    ),
     "images of two sizes": (
         images("left/color", lambda image: image[:50], 4),
         ("color/00004.png", "96x50", "96x72"),
@@ -415,6 +428,10 @@ BOARDS: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "bomb among the pictures": (
         bomb("calibration/left/00000.png"),
         ("calibration/left/00000.png", "100000x100000"),
+    ),
+    "an array called .png": (
+        lambda raw: renamed_array(raw.folder / "calibration/left/00000.png"),
+        ("calibration/left/00000.png", "holds .npy in spite of its name"),
     ),
     "a cut picture": (
         torn("calibration/right/00000.png", 0.7),

@@ -144,6 +144,8 @@ class RecordedStream:
             )
         if self.kind == "depth":
             _check_depth(path, announced)
+        else:
+            _check_color(path, announced)
         if not is_whole(path, announced.form):
             fail(path, "was cut off: its end is missing. Record or export it again")
         return announced
@@ -160,6 +162,13 @@ class RecordedStream:
 
     def _refuse(self, index: int, reason: str) -> NoReturn:
         raise ImportFailedError(f"{self.name(index)}: {reason}.")
+
+
+def _check_color(path: Path, announced: AnnouncedImage) -> None:
+    """Refuse what a file called ``.png`` or ``.jpg`` must not hold: it would be copied as it is."""
+    if announced.form not in {"PNG", "JPEG"}:
+        form = "OpenEXR" if announced.form == "EXR" else ".npy"
+        fail(path, f"holds {form} in spite of its name; color is PNG or JPEG. Export it again")
 
 
 def _check_depth(path: Path, announced: AnnouncedImage) -> None:
@@ -210,6 +219,7 @@ def check_picture(path: Path, size: tuple[int, int]) -> None:
         ImportFailedError: If it does; names it.
     """
     announced = _announced(path)
+    _check_color(path, announced)
     if announced.size != size:
         fail(
             path,

@@ -24,11 +24,15 @@ _TILED, _DEEP, _PARTS = 0x200, 0x800, 0x1000
 """Flags in the field of the version."""
 _MOST_ATTRIBUTES, _LONGEST_NAME = 4096, 255
 _MOST_CHANNELS = 64
+_SHOWN = 8
+"""Channels that a message names."""
 _LONGEST_LIST = 1 << 16
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32, 256, 1)
 """Rows of a chunk by how it is compressed."""
 _NUMBERS = {0: np.dtype(np.uint32), 1: np.dtype(np.float16), 2: np.dtype(np.float32)}
-_DEPTH_NAMES = ("z", "depth", "distance")
+_PLACES = 1 << 16
+"""Places of chunks that are read at once."""
+_DEPTH_NAMES = ("z", "depth")
 _PICTURE = ("r", "g", "b")
 
 
@@ -100,11 +104,15 @@ def is_whole_exr(path: Path) -> bool:
         if header.table_at + 8 * header.chunk_count > end:
             return False
         stream.seek(header.table_at)
-        place = np.frombuffer(stream.read(8 * header.chunk_count), "<u8")
-        # Places are written last: those of a file that was left half written are 0.
-        if place.min() < header.table_at or place.max() >= end:
-            return False
-        last = int(place.max())
+        last = 0
+        # A file of tiles of one pixel has as many places as pixels: not all are held at once.
+        for first in range(0, header.chunk_count, _PLACES):
+            count = min(_PLACES, header.chunk_count - first)
+            place = np.frombuffer(stream.read(8 * count), "<u8")
+            # Places are written last: those of a file that was left half written are 0.
+            if place.min() < header.table_at or place.max() >= end:
+                return False
+            last = max(last, int(place.max()))
         size_at = last + (16 if header.is_tiled else 4)
         stream.seek(size_at)
         size = stream.read(4)
@@ -130,8 +138,11 @@ def depth_channels(names: list[str]) -> list[str]:
     for name in ("y", "r"):
         if not named and name in by_name:
             return [by_name[name]]
+    shown = ", ".join(names[:_SHOWN])
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    several = ", several of which may be depth" if named else ""
     raise ValueError(
-        f"has the channels {', '.join(names)}, and not one of them is called Z, depth, Y or R. "
+        f"has the channels {shown}{more}{several or ', and none is called Z, depth, Y or R'}. "
         "Export depth alone"
     )
 
@@ -217,11 +228,14 @@ def _channels(content: bytes) -> dict[str, np.dtype[Any]]:
     while at < len(content) and content[at]:
         end = content.find(b"\0", at)
         kind, x, y = struct.unpack_from("<i4x2i", content, end + 1)
-        if end < 0 or kind not in _NUMBERS or len(channels) == _MOST_CHANNELS:
+        # Names are shown in messages, where control characters could pretend anything.
+        name = content[at:end].decode("utf-8", "replace")
+        is_sound = 0 < end <= at + _LONGEST_NAME and name.isprintable() and "\ufffd" not in name
+        if not is_sound or kind not in _NUMBERS or len(channels) == _MOST_CHANNELS:
             raise ValueError(f"has a damaged list of channels, or more than {_MOST_CHANNELS}")
         if (x, y) != (1, 1):
             raise ValueError("has channels of several resolutions. Export depth alone")
-        channels[content[at:end].decode("latin-1")] = _NUMBERS[kind]
+        channels[name] = _NUMBERS[kind]
         at = end + 17
     if not channels:
         raise ValueError("has no channels in its OpenEXR header")

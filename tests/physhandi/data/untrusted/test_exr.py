@@ -1,5 +1,6 @@
 """Headers of OpenEXR images, whether they are whole, and depth out of them."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,11 @@ from physhandi.data.untrusted.media import media_decoder
 HEIGHT, WIDTH = 300, 40  # More rows than the largest chunk has.
 
 
-def written(path: Path, compression: OpenEXR.Compression, **header: object) -> np.ndarray:
+def written(
+    path: Path, compression: OpenEXR.Compression, name: str = "Z", **header: object
+) -> np.ndarray:
     image = np.random.default_rng(0).random((HEIGHT, WIDTH)).astype(np.float32)
-    OpenEXR.File({"compression": compression, **header}, {"Z": image}).write(str(path))
+    OpenEXR.File({"compression": compression, **header}, {name: image}).write(str(path))
     return image
 
 
@@ -80,8 +83,13 @@ def test_an_image_whose_writer_was_killed_is_not_whole(tmp_path):
         (exr(9, 9, flags=0x200, tiles=bytes(9)), "damaged OpenEXR header"),
         (exr(9, 9, flags=0x200, tiles=b"\x20\0\0\0\x20\0\0\0\x01"), "several sizes"),
         (exr(9, 9, flags=0x200), "cut off"),
-        (exr(9, 9, names=("u", "v")), "channels u, v, and not one of them"),
-        (exr(9, 9, names=("a.Z", "b.Z")), "channels a.Z, b.Z"),
+        (exr(9, 9, names=("u", "v")), "channels u, v, and none is called Z, depth, Y or R"),
+        (exr(9, 9, names=("A", "distance")), "A, distance, and none"),  # Along the ray, mostly.
+        (exr(9, 9, names=("a.Z", "b.Z")), "channels a.Z, b.Z, several of which may be depth"),
+        (exr(9, 9, names=("x" * 255, *"abcdefgh")), "f, g and 1 more, and none"),
+        (exr(9, 9, names=("\x1b[2JZ", "u")), "damaged list of channels"),
+        (exr(9, 9, names=("x" * 256, "u")), "damaged list of channels"),
+        (exr(9, 9, names=("u",)).replace(b"u\0\x02", b"\xff\0\x02"), "damaged list of channels"),
         (exr(9, 9)[:60], "cut off"),
         (exr(9, 9).replace(b"dataWindow", b"dataMirror"), "no size"),
         (exr(9, 9).replace(b"comments", b"x" * 300), "damaged OpenEXR header"),
@@ -92,6 +100,36 @@ def test_what_no_depth_can_be_is_told_by_its_header(tmp_path, content, words):
     path.write_bytes(content)
     with pytest.raises(ValueError, match=words):
         announced_image(path)
+
+
+def test_a_layer_may_have_a_name_of_any_alphabet(tmp_path):
+    path = tmp_path / "depth.exr"
+    image = written(path, OpenEXR.ZIP_COMPRESSION, "Ebène 深度.Z")
+    with path.open("rb") as stream:
+        names = [*read_exr_header(stream).channels]
+    assert names == ["Ebène 深度.Z"]
+    np.testing.assert_array_equal(media_decoder().exr(path, names), image)
+
+
+def test_a_table_as_long_as_the_picture_takes_no_memory(tmp_path):
+    path = tmp_path / "depth.exr"
+    count = 2_000_000
+    content = exr(1, count, compression=b"\0")
+    places = np.full(count, len(content), "<u8")
+    places[-1] = len(content) + 8 * count - 4  # Only the last one tells that the end is missing.
+    with path.open("wb") as stream:
+        stream.write(content)
+        places.tofile(stream)
+    del places
+    tracemalloc.start()
+    try:
+        assert not is_whole_exr(path)
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+        with path.open("ab") as stream:
+            stream.write(bytes(8))
+        assert is_whole_exr(path)
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
