@@ -13,6 +13,8 @@ from physhandi.data.files import named_fields, parse_yaml, require_plain
 from physhandi.errors import SequenceError
 
 FORMAT = "physhandi-sequence/1"
+UNFINISHED = "unfinished"
+"""What provenance says of masks while they are being stored."""
 FILE = "sequence.yaml"
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _SIZE_LIMIT = 4_000_000
@@ -77,6 +79,11 @@ class SequenceMeta:
     """Kind of object; None if that is to be found from what the first frame shows."""
     mass: float | None = None
     """Mass of the object [kg]; None if nobody weighed it."""
+
+    @property
+    def has_unfinished_masks(self) -> bool:
+        """Whether the process ended while masks and tracks were being put in place."""
+        return bool((named_fields(self.provenance.get("masks")) or {}).get(UNFINISHED))
 
     @property
     def reconstruction_count(self) -> int:

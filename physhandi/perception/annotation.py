@@ -25,7 +25,7 @@ from physhandi.data.files import (
     write_yaml,
 )
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_meta import FILE, SequenceMeta, read_meta
+from physhandi.data.sequence_meta import FILE, UNFINISHED, SequenceMeta, read_meta
 from physhandi.data.view import View
 from physhandi.errors import SequenceError, UsageError
 from physhandi.perception.hand_size import MEASURED_PALMS, palm_length
@@ -51,6 +51,8 @@ _HASH = "model_sha256"
 """Provenance field of masks and tracks that a model of the user made here."""
 _UNFINISHED = "unfinished"
 """Provenance field of masks that are being stored."""
+_CORRECTIONS = "corrections"
+"""What it calls the masks that somebody painted."""
 _TRACK_FILES = ("track.npy", "track_visible.npy")
 _FILES = ("mask", *_TRACK_FILES)
 
@@ -178,7 +180,9 @@ def correct_masks(
     for one in corrections:
         masks[one.view][one.frame] = one.label
     about = named_fields(sequence.provenance.get("masks")) or {"source": "unknown"}
-    earlier = [entry for entry in map(named_fields, _listed(about, "corrections")) if entry]
+    if not _is_being_made(sequence.meta):  # Or views lack masks that only a click finds.
+        about.pop(UNFINISHED, None)
+    earlier = [entry for entry in map(named_fields, _listed(about, _CORRECTIONS)) if entry]
     if carries_on:
         clicks = [entry for entry in map(named_fields, _listed(about, "clicks")) if entry]
         fixed = {
@@ -203,7 +207,7 @@ def correct_masks(
     new = [{"view": one.view, "frame": one.frame, "carried_on": carries_on} for one in corrections]
     done = {(entry["view"], entry["frame"]) for entry in new}
     unchanged = [e for e in earlier if (e.get("view"), e.get("frame")) not in done]
-    provenance = {**sequence.provenance, "masks": {**about, "corrections": [*unchanged, *new]}}
+    provenance = {**sequence.provenance, "masks": {**about, _CORRECTIONS: [*unchanged, *new]}}
     if of_tracks:
         provenance["tracks"] = of_tracks
     return _store(sequence, masks, tracks, provenance)
@@ -282,7 +286,7 @@ def _store(
 ) -> Sequence:
     """Give views their new masks and tracks, one after the other, and say where they come from."""
     # If the process ends meanwhile, they are known to be ours, and not to be whole.
-    _note(sequence, {**provenance, "masks": {**provenance["masks"], _UNFINISHED: True}})
+    _note(sequence, {**provenance, "masks": {**provenance["masks"], UNFINISHED: True}})
     for view in sequence.views:
         sweep_temporary(view.folder.glob(".*.tmp"))
         if view.name not in masks:
@@ -310,17 +314,19 @@ def lacks_masks(folder: Path) -> bool:
     """
     _mend(folder)
     sequence = Sequence.load(folder)
-    return _is_unfinished(sequence.meta) or not any(view.has_mask for view in sequence.views)
+    return _is_being_made(sequence.meta) or not any(view.has_mask for view in sequence.views)
 
 
-def _is_unfinished(meta: SequenceMeta) -> bool:
-    return bool((named_fields(meta.provenance.get("masks")) or {}).get(_UNFINISHED))
+def _is_being_made(meta: SequenceMeta) -> bool:
+    """Tell whether masks were being stored that can be made again, not corrections by hand."""
+    about = named_fields(meta.provenance.get("masks")) or {}
+    return meta.has_unfinished_masks and not about.get(_CORRECTIONS)
 
 
 def _mend(folder: Path) -> None:
     """Remove tracks of which a process that ended had put only half in place."""
     meta = read_meta(folder)
-    for view in meta.views if _is_unfinished(meta) else ():
+    for view in meta.views if meta.has_unfinished_masks else ():
         halves = [folder / "views" / view.name / name for name in _TRACK_FILES]
         if not all(path.is_file() for path in halves):
             for path in halves:
@@ -333,7 +339,7 @@ def _is_own(sequence: Sequence, part: str) -> bool:
 
 
 def _check_own(sequence: Sequence) -> None:
-    if _is_unfinished(sequence.meta):
+    if _is_being_made(sequence.meta):
         return
     for part, there in (
         ("masks", any(view.has_mask for view in sequence.views)),

@@ -110,6 +110,16 @@ _SCATTERED = Problem(
 )
 
 
+_UNFINISHED = Problem(
+    level="warning",
+    message="Masks and tracks were being stored when the process ended, so those of some views may "
+    "be missing or older than others.",
+    file="views/*/mask",
+    field="provenance.masks",
+    remedy="find or correct them again",
+)
+
+
 def check_recording(
     recording: Sequence | Path | str,
     progress: Progress | None = None,
@@ -144,7 +154,7 @@ def check_recording(
     if any(_stops_all(error, sequence) for error in errors):
         stages = _stopped(STAGES, READABLE)
         return RecordingCheck(stages=stages, problems=tuple(_limited(errors)))
-    warnings: list[Problem] = []
+    warnings = [_UNFINISHED] if sequence.meta.has_unfinished_masks else []
     if stages[HANDS].is_ready:
         doubts, is_seen = _judge_hands(sequence)
         warnings += doubts

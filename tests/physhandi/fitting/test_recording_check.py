@@ -52,6 +52,16 @@ def test_nothing_is_said_of_a_whole_recording(filmed: Path, tmp_path: Path) -> N
     assert sheet.stages[OBSERVATION].is_ready
 
 
+def test_masks_whose_storing_ended_midway_are_doubted(filmed: Path) -> None:
+    meta = filmed / "sequence.yaml"
+    text = meta.read_text()
+    about = "provenance: {masks: {source: built-in, unfinished: true}}"
+    meta.write_text(text.replace("provenance: {}", about))
+    (problem,) = ph.check(filmed).problems
+    assert (problem.level, problem.field) == ("warning", "provenance.masks")
+    assert "those of some views may be missing or older" in problem.message
+
+
 def test_every_broken_file_is_listed_with_its_frame(filmed: Path) -> None:
     both(truncated(DEPTH.format(1)), truncated(DEPTH.format(3)))(filmed)
     image(MASK.format(2), lambda mask: mask + np.uint8(7))(filmed)

@@ -219,3 +219,27 @@ def test_masks_and_tracks_can_be_made_again_wherever_their_storing_ended(
         assert all(view.has_mask for view in done.views)
         assert all((view.track is not None) == bool(clicks) for view in done.views)
     assert ends >= 6
+
+
+def test_masks_whose_correction_ended_midway_are_not_made_again_unasked(tmp_path, monkeypatch):
+    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=3)
+    folder = annotate(sequence.folder, [Click(*disc_click())]).folder
+    meta = folder / "sequence.yaml"
+    meta.write_text(meta.read_text().replace("source: built-in", "source: by hand"))
+    view = sequence.views[0].name
+    painted = np.ones_like(Sequence.load(folder).views[0].mask(1))
+
+    def killed(*_: object) -> None:
+        raise _Killed
+
+    monkeypatch.setattr(annotation, "_put_in_place", killed)
+    with pytest.raises(_Killed):
+        correct_masks(folder, [Correction(view, 1, painted)])
+    monkeypatch.undo()
+    assert Sequence.load(folder).meta.has_unfinished_masks
+    assert not lacks_masks(folder)
+    with pytest.raises(UsageError, match="masks that were not made here"):
+        annotate(folder, [Click(*disc_click())])
+    done = correct_masks(folder, [Correction(view, 1, painted)])
+    assert not done.meta.has_unfinished_masks
+    assert (done.views[0].mask(1) == 1).all()
