@@ -498,7 +498,10 @@ def _track_figures(sequence: Sequence, surface: Any) -> dict[str, Any]:
 
     lifted = np.concatenate([lifted_tracks(view) for view in sequence.depth_views], axis=1)
     scores = track_scores(lifted, surface)
-    alive = tracks_alive([v.track_visible for v in sequence.views if v.track_visible is not None])
+    none = np.zeros((sequence.frame_count, 0), np.bool_)
+    alive = tracks_alive(
+        [none if view.track_visible is None else view.track_visible for view in sequence.views]
+    )
     return {
         "median_mm": _MILLIMETRES * scores["median"],
         "mean_mm": _MILLIMETRES * scores["mean"],

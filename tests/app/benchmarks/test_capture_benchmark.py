@@ -12,7 +12,10 @@ from waiting import LIMIT_S
 from app import cli
 from app.benchmarks import capture
 from app.benchmarks.capture import CaptureOrder, ScenePlace
+from physhandi.data.sequence import Sequence
+from physhandi.data.truth import read_truth
 from physhandi.errors import RunError
+from physhandi.metrics.truth_metrics import true_surface
 from physhandi.progress import NullProgress, Progress
 from physhandi.synthetic import synthesize
 from physhandi.synthetic.engines.truth import PhysicalTruth
@@ -53,6 +56,12 @@ def test_a_made_scene_is_captured_imported_and_scored(
     assert found["tracks"]["median_mm"] < 5.0
     assert len(found["tracks"]["least_by_view"]) == 2
     assert set(capture.reached(found)) == set(capture.CAPTURE_GOALS) - {"chamfer_ratio"}
+    for name in ("track.npy", "track_visible.npy"):
+        (place.imported / "views/camera1" / name).unlink()
+    surface = true_surface(read_truth(place.recording))
+    fewer = capture._track_figures(Sequence.load(place.imported), surface)
+    assert fewer["least_by_view"][1] == 0
+    assert fewer["least"] == fewer["least_by_view"][0] > 0
 
 
 def test_the_ratio_is_that_of_mean_errors_and_unknown_if_a_fit_is_not_scored() -> None:
