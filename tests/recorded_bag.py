@@ -1,5 +1,6 @@
 """Writes small ROS bags of the made-up scene, as drivers publish it."""
 
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -119,7 +120,11 @@ def time_of(frame: int, late: int = 0) -> int:
 
 
 def write_realsense_bag(
-    path: Path, color: PinholeCamera, depth: PinholeCamera, reference: np.ndarray, frames: int
+    path: Path,
+    color: PinholeCamera,
+    depth: PinholeCamera,
+    reference: np.ndarray,
+    frames: Iterable[int],
 ) -> None:
     """A bag with the topics of librealsense; `reference` maps to the world, as cameras do."""
     with Recorder(path, ros=1) as bag:
@@ -131,7 +136,7 @@ def write_realsense_bag(
             bag.write(f"{topics[kind]}/tf/0", name, bag.transform(to_stream))
         units = bag.kind("std_msgs/msg/Float32")(0.0001)
         bag.write("/device_0/sensor_0/option/Depth Units/value", "std_msgs/msg/Float32", units)
-        for frame in range(frames):
+        for frame in frames:
             time = time_of(frame)
             image = np.round(10_000 * picture(depth, frame)[1]).astype(np.uint16)
             bag.image(f"{topics['depth']}/image/data", image, "mono16", time)

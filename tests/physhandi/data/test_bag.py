@@ -6,12 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from raw_capture import CAMERAS, camera_at, picture
+from raw_capture import BOARD, CAMERAS, RawCapture, camera_at, picture
 from recorded_bag import TREE, Recorder, jpeg, png, shown, time_of, write_realsense_bag
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers import bag as bag_reader
-from physhandi.data.importers.capture import import_capture
+from physhandi.data.importers.capture import CaptureOptions, import_capture
 from physhandi.errors import CancelledError, ImportFailedError, UsageError
 from physhandi.progress import NullProgress, Progress
 
@@ -38,7 +38,7 @@ def test_a_bag_with_realsense_topics(tmp_path):
     color = camera_at(30, 2)
     depth = beside(color)
     reference = camera_at(33, 2).T_world_camera  # Neither of both: transforms must be chained.
-    write_realsense_bag(tmp_path / "take.bag", color, depth, reference, FRAMES)
+    write_realsense_bag(tmp_path / "take.bag", color, depth, reference, range(FRAMES))
     sequence = import_capture(tmp_path / "take.bag", tmp_path / "out")
     assert [view.name for view in sequence.views] == ["device_0"]
     assert sequence.frame_count == FRAMES
@@ -49,6 +49,30 @@ def test_a_bag_with_realsense_topics(tmp_path):
     assert np.array_equal(view.color(2), true_color)
     assert_depth_fits(view.depth(2), true_depth, true_color[..., 0] == 200)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "take.bag"]
+
+
+def test_two_realsense_bags_are_placed_by_pictures_of_a_board_beside_them(tmp_path):
+    cameras = {"left": camera_at(30, 4), "right": camera_at(110, 4)}
+    raw = RawCapture(tmp_path / "fold", cameras)
+    raw.photograph_board()
+    frames = {"left": range(12), "right": [1, *range(3, 13)]}  # Begins later, and drops one.
+    for name, camera in cameras.items():
+        bag = raw.folder / f"{name}.bag"
+        write_realsense_bag(bag, camera, beside(camera), camera.T_world_camera, frames[name])
+    options = CaptureOptions(board=BOARD)
+    sequence = import_capture(raw.folder, tmp_path / "out", options=options)
+    assert [view.name for view in sequence.views] == ["left", "right"]
+    assert sequence.frame_count == 11
+    for view in sequence.views:
+        assert np.array_equal(view.color(4), picture(cameras[view.name], 5)[0])
+    left, right = (view.camera.T_world_camera for view in sequence.views)
+    true = cameras["left"].T_camera_world @ cameras["right"].T_world_camera
+    np.testing.assert_allclose(np.linalg.inv(left) @ right, true, atol=4e-3)
+    notes = sequence.provenance["notes"]
+    assert "right/depth has no image for frame 1." in notes
+    assert "right/color has no image for frame 1; its neighbour is repeated." in notes
+    again = import_capture(raw.folder, tmp_path / "out", options=options, keeps_same=True)
+    assert again.provenance == sequence.provenance
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
