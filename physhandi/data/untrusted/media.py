@@ -31,9 +31,12 @@ _ROOM = 8 * MOST_PIXELS
 """Size of what both processes share, in which images are handed over [byte]."""
 _LONGEST_S = 30.0
 """Time that one image may take [s]."""
+_MOST_PASSED = 200
+"""Frames of a video that are passed over in one go, for which there is as much time [frame]."""
 _LONGEST_CPU_S = 24 * 3600
 _NO_MEMORY = -4
 """What OpenCV calls a lack of memory (``StsNoMem``)."""
+_CRASHED = "crashed what decodes it"
 _OPEN = 8
 """Videos that are kept open."""
 
@@ -93,8 +96,16 @@ class MediaDecoder:
             ImportFailedError: See `image`.
         """
         place = f"{path}, frame {index}"
-        answer, image = self._ask(place, do="frame", path=str(path.absolute()), index=index)
-        return image, int(answer["at"])
+        reached, restarts = -1, 0
+        while True:
+            answer, image = self._ask(place, do="frame", path=str(path.absolute()), index=index)
+            if not answer.get("is_on_the_way"):
+                return image, int(answer["at"])
+            # A frame on the way that crashes it has a new process begin at frame 0.
+            restarts += int(answer["at"]) <= reached
+            reached = int(answer["at"])
+            if restarts > 1:
+                raise _refusal(place, _CRASHED)
 
     def release(self, path: Path) -> None:
         """Close a video."""
@@ -127,14 +138,8 @@ class MediaDecoder:
             try:
                 answer = self._child.ask(request, self._longest_s)
             except ChildEndedError as end:
-                deed = (
-                    f"decoding it took more than {self._longest_s:g} s"
-                    if end.is_late
-                    else "crashed what decodes it"
-                )
-                raise ImportFailedError(
-                    f"{place}: {deed}. It is damaged or made to do harm; record or export it again."
-                ) from None
+                late = f"decoding it took more than {self._longest_s:g} s"
+                raise _refusal(place, late if end.is_late else _CRASHED) from None
             if answer.get("is_too_large"):
                 raise ImportFailedError(
                     f"{place}: decoding it needs more memory than is allowed "
@@ -149,6 +154,12 @@ class MediaDecoder:
         kind: Any = np.dtype(str(answer["dtype"]))
         count = math.prod(shape)
         return np.frombuffer(cast("Any", self._area), kind, count).reshape(shape).copy()
+
+
+def _refusal(place: str, deed: str) -> ImportFailedError:
+    return ImportFailedError(
+        f"{place}: {deed}. It is damaged or made to do harm; record or export it again."
+    )
 
 
 def _memory() -> Any:
@@ -176,17 +187,19 @@ class _Videos:
         self._open: dict[str, tuple[Any, int]] = {}
 
     def frame(self, path: str, index: int) -> tuple[dict[str, Any], ndarray | None]:
-        """Decode a frame; tells how far that went."""
+        """Decode a frame; tells how far that went, and whether it has to be asked for again."""
         capture, at = self._open.pop(path, (None, 0))
         if capture is None or index < at:
             capture, at = cv2.VideoCapture(path), 0
-        while at < index and capture.grab():
+        stop = min(index, at + _MOST_PASSED)
+        while at < stop and capture.grab():
             at += 1
+        is_on_the_way = at == stop < index
         is_read, image = capture.read() if at == index else (False, None)
         self._open[path] = capture, at + is_read
         while len(self._open) > _OPEN:
             self.release(next(iter(self._open)))
-        return {"at": at}, image if is_read else None
+        return {"at": at, "is_on_the_way": is_on_the_way}, image if is_read else None
 
     def release(self, path: str) -> None:
         """Close a video."""

@@ -14,9 +14,10 @@ def write_png(path, shape=(48, 64, 3), kind=np.uint8):
 
 
 def write_video(path, frames=6):
+    """Write frames of brightness 20, 50, 80, … which begins anew at 240."""
     video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
     for frame in range(frames):
-        video.write(np.full((48, 64, 3), 20 + 30 * frame, np.uint8))
+        video.write(np.full((48, 64, 3), (20 + 30 * frame) % 240, np.uint8))
     video.release()
 
 
@@ -95,3 +96,29 @@ def test_a_file_that_takes_too_long_is_named(hostile, monkeypatch):
     monkeypatch.setattr(decoder, "_longest_s", 0.5)
     with pytest.raises(ImportFailedError, match=r"hang\.png: decoding it took more than 0.5 s"):
         decoder.image(folder / "hang.png", cv2.IMREAD_COLOR)
+
+
+def test_a_frame_far_on_is_reached_in_steps_of_which_each_has_its_time(tmp_path, monkeypatch):
+    write_video(tmp_path / "long.avi", 450)
+    decoder = media_decoder()
+    asked = []
+    ask = MediaDecoder._ask
+
+    def listen(decoder, place, **request):
+        answer, image = ask(decoder, place, **request)
+        asked.append((answer["at"], image is not None))
+        return answer, image
+
+    monkeypatch.setattr(MediaDecoder, "_ask", listen)
+    image, at = decoder.frame(tmp_path / "long.avi", 404)
+    assert at == 404
+    assert abs(float(image.mean()) - 140) < 3  # (20 + 30 * 404) % 240
+    assert asked == [(200, False), (400, False), (404, True)]
+    assert decoder.frame(tmp_path / "long.avi", 900) == (None, 450)
+
+
+def test_a_frame_on_the_way_that_ends_its_decoder_is_told_and_not_tried_for_ever(hostile):
+    decoder, folder = hostile
+    write_video(folder / "later.avi", 401)
+    with pytest.raises(ImportFailedError, match=r"later\.avi, frame 400: crashed"):
+        decoder.frame(folder / "later.avi", 400)
