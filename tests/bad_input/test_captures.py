@@ -280,6 +280,10 @@ REFUSED: dict[str, tuple[Damage, tuple[str, ...]]] = {
         lambda raw: arrays(raw, lambda depth, _: np.full_like(depth, np.nan)),
         ("left/depth", "no distance at all", "not finite"),
     ),
+    "negative depth": (
+        lambda raw: arrays(raw, lambda depth, _: -depth),
+        ("left/depth", "no distance at all", "negative", "change its sign"),
+    ),
     "depth in tenths of millimetres": (
         images("left/depth", lambda image: image * 10),
         ("left/depth", "m away", "--depth-scale", "0.0001"),

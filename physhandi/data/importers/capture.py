@@ -514,7 +514,8 @@ def _depth_scale(
         fail(
             stream.path,
             f"holds no distance at all in frames {', '.join(map(str, chosen.tolist()))}: all "
-            "values are 0 or not finite. Record depth again, or remove it to use color alone",
+            "values are 0, negative, not finite or too large. Record depth again (or change "
+            "its sign, if it is along OpenGL's -z), or remove it to use color alone",
         )
     median = float(np.median(medians))
     scale = given if given is not None else source.view.depth_scale
