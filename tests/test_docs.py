@@ -40,6 +40,18 @@ def test_the_first_page_is_short_and_every_page_is_in_the_index() -> None:
     assert pages - linked == set()
 
 
+def test_the_first_page_counts_what_follows() -> None:
+    words = ("Zero", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
+    text = (ROOT / "README.md").read_text()
+    (section,) = re.findall(r"^## (\w+) things to do$(.+?)^## ", text, re.M | re.S)
+    assert len(re.findall(r"^\*\*\w{2,}", section[1], re.M)) == words.index(section[0])
+    (profiles,) = re.findall(r"^(\w+) profiles set every switch: ([^;]+?) *\(their", text, re.M)
+    named = re.findall(r"`(\w+)`", profiles[1])
+    shipped = {path.stem for path in (ROOT / "physhandi/fitting/profiles").glob("*.yaml")}
+    assert len(named) == words.index(profiles[0])
+    assert set(named) == shipped
+
+
 def defined_names(path: Path) -> set[str]:
     """Functions and classes of a module, and methods as ``Class.method``."""
     found = set()
