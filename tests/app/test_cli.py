@@ -487,7 +487,7 @@ def test_an_option_that_takes_several_values_may_be_given_several_times() -> Non
     ]
     assert len(lists) > 15
     plain = [place for place, inner in lists if inner is not tuple]
-    # A setting holds no spaces, so that one follows each --set.
+    # Each --set takes one setting, so that a sequence may follow it.
     assert plain == ["reconstruct --settings"]
 
 
