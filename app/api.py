@@ -16,7 +16,6 @@ from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app.comparison import NewComparison
 from app.ids import ItemId
 from app.jobs.about import Line, RunChanges, change_about
 from app.jobs.catalog import Catalog, NotFoundError
@@ -53,6 +52,7 @@ from app.jobs.views import (
 )
 from app.jobs.watch import Feed, Watch, preview_bytes
 from app.root_path import address_on
+from app.viewer.compare.request import NewComparison
 from app.viewer.sessions import AnySession, Sessions
 from physhandi.fitting.config import named_profile, profile_names
 

@@ -20,7 +20,6 @@ from starlette.exceptions import HTTPException
 from app.api import create_api
 from app.audit import Audited, AuditLog
 from app.body_limit import BodyLimit
-from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
 from app.exports.shares import Shares
@@ -43,6 +42,7 @@ from app.jobs.storage.room import NoRoomError
 from app.jobs.views import describe_run
 from app.jobs.watch import Feed
 from app.pages import Pages, create_pages
+from app.pages.comparing import create_comparing
 from app.previews.store import Previews
 from app.root_path import BelowRootPath
 from app.security import Gatekeeper, Security

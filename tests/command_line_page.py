@@ -56,9 +56,16 @@ def kind_of(hint: Any) -> str:
         parts = [kind_of(part) for part in get_args(hint) if part is not type(None)]
         return " or ".join(parts)
     if get_origin(hint) is tuple:
-        return f"{kind_of(get_args(hint)[0])} …"
+        return f"{kind_of(get_args(hint)[0]).removesuffix(' …')} …"
     names = {str: "text", int: "whole number", float: "number", bool: "switch", Path: "path"}
     return names[hint]
+
+
+def told_default(hint: Any) -> str:
+    """What help says in the place of a default that the signature does not hold."""
+    notes = hint.__metadata__ if get_origin(hint) is Annotated else ()
+    told = (getattr(note, "help_behavior_hint", None) or "" for note in notes)
+    return "".join(re.findall(r"^\(default: (.+)\)$", "".join(told)))
 
 
 def default_of(value: Any) -> str:
@@ -88,7 +95,7 @@ def option(name: str, hint: Any, default: Any, about: str) -> tuple[str, str, st
     return (
         shown.upper() if is_positional(hint) else f"`--{shown}`",
         kind_of(hint),
-        default_of(default),
+        default_of(default) or told_default(hint),
         text,
     )
 

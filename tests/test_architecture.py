@@ -137,6 +137,42 @@ def test_kernels_write_only_to_outputs() -> None:
                     )
 
 
+def spoken(path: Path) -> Iterator[ast.AST]:
+    """Where a module writes to standard output or standard error, whatever the way."""
+    kinds = ast.Call | ast.Attribute | ast.ImportFrom
+    for node in (node for node in ast.walk(tree(path)) if isinstance(node, kinds)):
+        match node:
+            case ast.Call(func=ast.Name("print" | "input")):
+                yield node
+            case ast.Call(func=ast.Attribute(ast.Name("os"), "write"), args=[ast.Constant(), *_]):
+                yield node
+            case ast.Attribute(ast.Name("sys"), "stderr" | "stdout" | "__stderr__" | "__stdout__"):
+                yield node
+            case ast.Attribute(ast.Name("warnings"), "warn" | "warn_explicit"):
+                yield node
+            case ast.Attribute(ast.Name("logging"), "basicConfig" | "StreamHandler"):
+                yield node
+            case ast.Attribute(ast.Name("traceback"), name) if name.startswith("print_"):
+                yield node
+            case ast.ImportFrom(module="sys" | "warnings" | "traceback"):
+                yield node
+
+
+def test_only_the_command_line_and_printed_progress_speak() -> None:
+    allowed = {
+        "physhandi/progress.py": 1,  # What `progress=True` asks for.
+        "physhandi/devices.py": 2,  # Passes on what a driver wrote before it failed.
+        "app/logs.py": 2,  # The server's log.
+        "app/jobs/worker.py": 1,  # The log of a fit, which its process writes.
+        "app/viewer/live/worker.py": 1,  # The same of live simulations.
+    }
+    counts = {place(path): sum(1 for _ in spoken(path)) for path in SOURCE_FILES}
+    speaking = {file: count for file, count in counts.items() if count}
+    of_commands = {file for file in speaking if file.startswith("app/cli/")}
+    assert sum(speaking.pop(file) for file in of_commands) > 10
+    assert speaking == allowed
+
+
 def test_every_configuration_field_is_documented() -> None:
     undocumented = []
     classes = [

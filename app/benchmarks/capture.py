@@ -136,7 +136,7 @@ def benchmark_capture(
                     result["scenes"][scene] = work.result()
                 except (PhysHandiError, OSError) as error:
                     result["failed"][scene] = describe(error)
-                    _tell(f"{scene}: failed: {describe(error)}")
+                    _Lines().report(f"{scene}: failed: {describe(error)}", 0, 0)
         except BaseException:
             steps.end()
             pool.shutdown(wait=False, cancel_futures=True)
@@ -144,11 +144,6 @@ def benchmark_capture(
     result["seconds"] = time.monotonic() - begin
     write_json(out / _RESULT, result)
     return result
-
-
-def _tell(line: str) -> None:
-    sys.stderr.write(f"{line}\n")
-    sys.stderr.flush()
 
 
 def _chosen(scenes: tuple[str, ...]) -> tuple[str, ...]:
@@ -202,7 +197,7 @@ class _Steps:
         lines = _Lines()
         label = " ".join(str(about[name]) for name in ("given", "search_seed") if name in about)
         label = f"{step} {label}".rstrip()
-        _tell(f"{scene}: {label}")
+        lines.report(f"{scene}: {label}", 0, 0)
         begin = time.monotonic()
         with self._lock:
             if self._is_ended:

@@ -7,7 +7,7 @@ from tyro.conf import Positional, arg
 
 from app.benchmarks.parts import PARTS, CaptureSize, FitProfile, Part
 from app.cli.lookup import find_result, sequence_of
-from app.cli.output import AsJson, DataDir, Device, Devices, show
+from app.cli.output import AsJson, DataDir, Device, Devices, Several, all_values, show
 from physhandi.data.layout import SequenceFiles
 from physhandi.devices import pick_device, pick_devices
 from physhandi.errors import RunError
@@ -95,8 +95,10 @@ def batch(
 def scaling(
     *,
     device: Device = "auto",
-    nodes: tuple[int, ...] = (500, 1000, 3000, 10_000, 50_000),
-    springs_at_node: tuple[int, ...] = (9, 18, 57),
+    nodes: Annotated[
+        Several[int], arg(help_behavior_hint="(default: 500 1000 3000 10000 50000)")
+    ] = (),
+    springs_at_node: Annotated[Several[int], arg(help_behavior_hint="(default: 9 18 57)")] = (),
     frame_count: Annotated[int, arg(name="frames", help="Frames of a rollout.")] = 3,
     time_limit_s: float = 300.0,
     as_json: AsJson = False,
@@ -108,12 +110,16 @@ def scaling(
         springs_at_node: Springs that end at a node on average.
         time_limit_s: Blocks that would take longer than this in all are left out [s].
     """
-    from physhandi.benchmarks.scaling import benchmark_scaling
+    from physhandi.benchmarks.scaling import (
+        NODE_COUNTS,
+        SCALED_SPRINGS_AT_NODE,
+        benchmark_scaling,
+    )
 
     result = benchmark_scaling(
         device=pick_device(device),
-        node_counts=nodes,
-        springs_at_node=springs_at_node,
+        node_counts=all_values(nodes, NODE_COUNTS),
+        springs_at_node=all_values(springs_at_node, SCALED_SPRINGS_AT_NODE),
         frame_count=frame_count,
         time_limit_s=time_limit_s,
     )
@@ -139,12 +145,12 @@ def splats(
 def capture(
     *,
     out: Path,
-    scenes: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: all of dev_rgbd)")] = (),
+    scenes: Annotated[Several[str], arg(help_behavior_hint="(default: all of dev_rgbd)")] = (),
     image_size: CaptureSize = "half",
     seed: int = 0,
     frames: int = 60,
     fit: FitProfile = "quick",
-    search_seeds: tuple[int, ...] = (42, 1),
+    search_seeds: Annotated[Several[int], arg(help_behavior_hint="(default: 42 1)")] = (),
     jobs: int = 1,
     device: Device = "auto",
     as_json: AsJson = False,
@@ -174,10 +180,10 @@ def capture(
         seed=seed,
         frames=frames,
         fit=fit,
-        search_seeds=search_seeds,
+        search_seeds=all_values(search_seeds, (42, 1)),
         device=pick_device(device),
     )
-    result = benchmark_capture(scenes, out, order, jobs=jobs)
+    result = benchmark_capture(all_values(scenes), out, order, jobs=jobs)
     show(result, as_json=as_json)
     if result["failed"]:
         raise RunError(f"{len(result['failed'])} scenes failed: {', '.join(result['failed'])}.")
@@ -187,7 +193,7 @@ def substeps(
     run: RunName = "towel_fold_quick",
     *,
     sequence: OfRun = None,
-    substeps: tuple[int, ...] = (),
+    substeps: Several[int] = (),
     device: Device = "auto",
     as_json: AsJson = False,
     data_dir: DataDir = None,
@@ -209,7 +215,7 @@ def substeps(
         finished.array(SequenceFiles(name).control),
         name=f"{finished.id}: {name}",
         device=device,
-        substeps=substeps,
+        substeps=all_values(substeps),
     )
     show(result, as_json=as_json)
 
@@ -233,7 +239,7 @@ def live(
 def viewer(
     run: RunName = "towel_fold_quick",
     *,
-    parts: tuple[Part, ...] = (),
+    parts: Several[Part] = (),
     quick: bool = False,
     as_json: AsJson = False,
     data_dir: DataDir = None,
@@ -265,4 +271,7 @@ def viewer(
 
     finished = find_result(run, data_dir)
     name = finished.sequence_names[0]
-    show(measure_viewer(finished, name, parts=parts or PARTS, is_quick=quick), as_json=as_json)
+    show(
+        measure_viewer(finished, name, parts=all_values(parts) or PARTS, is_quick=quick),
+        as_json=as_json,
+    )

@@ -2,13 +2,18 @@
 
 import json
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, TypeVar, cast
 
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 
 from physhandi.data.files import plain, without_non_finite
 
+Item = TypeVar("Item")
+Several = UseAppendAction[tuple[tuple[Item, ...], ...]]
+"""Values of an option that takes several: all after one (``--click A B``), or each after one of its
+own (``--click A --click B``). Of a plain tuple tyro would keep what follows the last one alone."""
 DataDir = Annotated[
     Path | None,
     arg(help="Folder with `sequences/` and `runs/` (PHYSHANDI_DATA_DIR, else `data`)."),
@@ -34,6 +39,16 @@ Store = Annotated[
     ),
 ]
 AsJson = Annotated[bool, arg(name="json", help="Print JSON instead of lines.")]
+
+
+def all_values(given: Several[Item], default: tuple[Item, ...] = ()) -> tuple[Item, ...]:
+    """Give the values of an option in their order, however often it was given.
+
+    Args:
+        given: The values after each time that it was given.
+        default: What it is if it was not given. Given without a value it has none.
+    """
+    return tuple(chain.from_iterable(given)) if given else default
 
 
 def show(result: Mapping[str, Any], *, as_json: bool = False) -> None:

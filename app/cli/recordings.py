@@ -8,7 +8,7 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from app.cli.lookup import find_sequence, folder_of_sequence, open_catalog
-from app.cli.output import AsJson, DataDir, Device, show
+from app.cli.output import AsJson, DataDir, Device, Several, all_values, show
 from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
@@ -19,6 +19,8 @@ from physhandi.progress import watched
 
 if TYPE_CHECKING:
     from physhandi.fitting.checks.recording_check import RecordingCheck
+
+Hands = Annotated[Several[Literal["right", "left"]], arg(help_behavior_hint="(default: right)")]
 
 
 def check(
@@ -93,7 +95,7 @@ def synthesize(
     out: Path,
     seed: int = 0,
     preset: str = "default",
-    change: tuple[str, ...] = (),
+    change: Several[str] = (),
     cameras: int = 3,
     frames: int = 90,
     set_out: float = -1.5,
@@ -137,7 +139,7 @@ def synthesize(
             out=out,
             seed=seed,
             preset=preset,
-            changes=dict(_level(text) for text in change),
+            changes=dict(_level(text) for text in all_values(change)),
             cameras=cameras,
             frames=frames,
             set_out=set_out,
@@ -156,7 +158,7 @@ def synthesize(
 def annotate(
     sequence: Positional[str],
     *,
-    click: tuple[str, ...] = (),
+    click: Several[str] = (),
     mask_model: Path | None = None,
     track_model: Path | None = None,
     trust_model_code: bool = False,
@@ -183,7 +185,7 @@ def annotate(
 
     folder = find_sequence(sequence, data_dir).folder
     require_unread(open_catalog(data_dir), folder)
-    clicks = [_click(text) for text in click]
+    clicks = [_click(text) for text in all_values(click)]
     with watched(True) as progress:
         done = find(
             folder,
@@ -308,7 +310,7 @@ def import_stereo(
     source: Positional[Path],
     *,
     out: Path,
-    hands: tuple[Literal["right", "left"], ...] = ("right",),
+    hands: Hands = (),
     origin: str = "",
     licence: str = "",
     overwrite: bool = False,
@@ -330,7 +332,7 @@ def import_stereo(
             source,
             out,
             progress,
-            hands=hands,
+            hands=all_values(hands, ("right",)),
             origin=origin,
             licence=licence,
             overwrite=overwrite,
@@ -342,7 +344,9 @@ def import_mocap(
     source: Positional[Path],
     *,
     out: Path,
-    controlled_markers: tuple[int, ...] = (0, 1, 11, 12),
+    controlled_markers: Annotated[
+        Several[int], arg(help_behavior_hint="(default: 0 1 11 12)")
+    ] = (),
     recording_rate: float = 100.0,
     frame_rate: float = 30.0,
     nodes_per_segment: int = 1,
@@ -377,7 +381,7 @@ def import_mocap(
             source,
             out,
             progress,
-            controlled_markers=controlled_markers,
+            controlled_markers=all_values(controlled_markers, (0, 1, 11, 12)),
             recording_rate=recording_rate,
             frame_rate=frame_rate,
             nodes_per_segment=nodes_per_segment,
@@ -458,8 +462,8 @@ def import_capture(
     stop: int | None = None,
     every: int = 1,
     frame_rate: float | None = None,
-    hands: tuple[Literal["right", "left"], ...] = ("right",),
-    click: tuple[str, ...] = (),
+    hands: Hands = (),
+    click: Several[str] = (),
     mask_model: Path | None = None,
     track_model: Path | None = None,
     trust_model_code: bool = False,
@@ -515,11 +519,11 @@ def import_capture(
         stop=stop,
         every=every,
         frame_rate=frame_rate,
-        hands=hands,
+        hands=all_values(hands, ("right",)),
     )
-    if not click and (mask_model or track_model):
+    clicks = [_click(text) for text in all_values(click)]
+    if not clicks and (mask_model or track_model):
         raise UsageError("--mask-model and --track-model find what --click names; give that too.")
-    clicks = [_click(text) for text in click]
     with watched(True) as progress:
         sequence = convert(
             source,

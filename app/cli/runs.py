@@ -15,7 +15,17 @@ from app.cli.lookup import (
     open_catalog,
     read_settings,
 )
-from app.cli.output import AsJson, DataDir, Device, Devices, EngineChoice, Store, show
+from app.cli.output import (
+    AsJson,
+    DataDir,
+    Device,
+    Devices,
+    EngineChoice,
+    Several,
+    Store,
+    all_values,
+    show,
+)
 from app.jobs.engines.following import FollowedRun, follow_to_end
 from app.jobs.engines.ray_engine import reached_cluster
 from app.jobs.order import default_name, fit_settings
@@ -143,7 +153,7 @@ def simulate(
     changes: OmitArgPrefixes[Changes] = Changes(),  # noqa: B008  # frozen
     *,
     out: Path | None = None,
-    sequence: tuple[str, ...] = (),
+    sequence: Several[str] = (),
     edits: Path | None = None,
     device: Device = "auto",
     data_dir: DataDir = None,
@@ -163,9 +173,8 @@ def simulate(
     device = pick_device(device)
     changed = {name: value for name, value in vars(changes).items() if value is not None}
     changed_parameters(SimulationParameters(), changed)  # Tells a wrong value before a run is made.
-    if sequence:
-        recordings = [find_sequence(name, data_dir) for name in sequence]
-    else:
+    recordings = [find_sequence(name, data_dir) for name in all_values(sequence)]
+    if not recordings:
         recordings = open_catalog(data_dir).sequences_of(source)[:1]
     config: dict[str, Any] = {"source": str(source.folder.resolve()), "parameters": changed}
     wanted = None if edits is None else read_edits(edits)

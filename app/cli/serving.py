@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from app.cli.lookup import open_catalog, read_settings
-from app.cli.output import DataDir, Store
+from app.cli.output import DataDir, Several, Store, all_values
 from physhandi.child import loading_modules
 from physhandi.devices import pick_device, pick_devices
 from physhandi.run_store import RunStore
@@ -21,7 +21,7 @@ def serve(
     root_path: str | None = None,
     engine: str | None = None,
     store: Store = None,
-    captures: tuple[Path, ...] = (),
+    captures: Several[Path] = (),
     token_file: Path | None = None,
     read_only_token_file: Path | None = None,
     demo: bool = False,
@@ -61,7 +61,7 @@ def serve(
         root_path=root_path,
         engine=engine,
         store=store,
-        captures=captures or None,
+        captures=all_values(captures) or None,
         token_file=token_file,
         read_only_token_file=read_only_token_file,
     )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from app.cli.lookup import cluster_settings, find_sequence, read_settings
-from app.cli.output import AsJson, DataDir, Devices, EngineChoice, show
+from app.cli.output import AsJson, DataDir, Devices, EngineChoice, Several, all_values, show
 from app.jobs.engines.ray_engine import reached_cluster
 from app.settings import LOCAL
 from physhandi.child import loading_modules
@@ -36,16 +36,16 @@ def evaluate_suite(
         Literal["tiny", "dev", "dev_rgbd", "dev_contact", "full"] | None,
         arg(help_behavior_hint="(default: tiny)"),
     ] = None,
-    methods: Annotated[tuple[str, ...], _OF_SUITE] = (),
-    seeds: Annotated[tuple[int, ...], _OF_SUITE] = (),
+    methods: Annotated[Several[str], _OF_SUITE] = (),
+    seeds: Annotated[Several[int], _OF_SUITE] = (),
     search_seeds: Annotated[
-        tuple[int, ...], arg(help_behavior_hint="(default: the profiles' own)")
+        Several[int], arg(help_behavior_hint="(default: the profiles' own)")
     ] = (),
     protocols: Annotated[
-        tuple[Literal["main", "single_view", "unseen", "robustness", "sensitivity"], ...], _OF_SUITE
+        Several[Literal["main", "single_view", "unseen", "robustness", "sensitivity"]], _OF_SUITE
     ] = (),
     sequences: Annotated[
-        tuple[str, ...], arg(help_behavior_hint="(default: the suite's scenes)")
+        Several[str], arg(help_behavior_hint="(default: the suite's scenes)")
     ] = (),
     splats: Annotated[
         int | None, arg(help_behavior_hint="(default: as many as a fit takes)")
@@ -87,7 +87,6 @@ def evaluate_suite(
         from app.cli.suite_processes import SuiteProcesses
         from physhandi.synthetic.suite import evaluation
         from physhandi.synthetic.suite.folder import check_folder
-        from physhandi.synthetic.suite.methods import method_settings, parse_method, searched_from
         from physhandi.synthetic.suite.suite import (
             NAMED_SETTINGS,
             check_seeds,
@@ -97,27 +96,26 @@ def evaluate_suite(
         )
 
     start = time.monotonic()
+    folders, fit_seeds = all_values(sequences), all_values(search_seeds)
     given = {
-        "methods": methods,
-        "seeds": seeds,
-        "search-seeds": search_seeds,
-        "protocols": protocols,
+        "methods": all_values(methods),
+        "seeds": all_values(seeds),
+        "search-seeds": fit_seeds,
+        "protocols": all_values(protocols),
         "splats": () if splats is None else (splats,),
     }
     chosen = find_suite(suite or "tiny")
-    if sequences and seeds:
+    if folders and seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
-    settings = _with_splats(chosen.settings if suite or not sequences else NAMED_SETTINGS, splats)
-    methods = methods or chosen.methods
-    for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
-        for one in searched_from(parse_method(method), search_seeds):
-            method_settings(one, settings)
-    check_seeds(seeds := seeds or chosen.seeds)
+    settings = _with_splats(chosen.settings if suite or not folders else NAMED_SETTINGS, splats)
+    compared = all_values(methods) or chosen.methods
+    _check_methods(compared, fit_seeds, settings)
+    check_seeds(scene_seeds := all_values(seeds) or chosen.seeds)
     server = read_settings(data_dir=data_dir, engine=engine)
     is_here = server.engine == LOCAL
     devices = pick_devices(device) if is_here else (device,)
-    named = [find_sequence(name, data_dir) for name in sequences]
-    title, cases, place = _table_of(chosen, seeds, named)
+    named = [find_sequence(name, data_dir) for name in folders]
+    title, cases, place = _table_of(chosen, scene_seeds, named)
     out = out or server.suite_dir / place
     check_folder(out, title, cases)
     cluster = None if is_here else reached_cluster(cluster_settings(server, device), SUITE_WORKER)
@@ -134,14 +132,15 @@ def evaluate_suite(
         alone = ONLY_CARD if workers and devices[0] != "cpu" else devices[0]
         order = evaluation.Order(
             title=title,
-            recordings=tuple(named) or make_recordings(chosen, seeds, out / "sequences", make),
-            methods=methods,
-            protocols=protocols or chosen.protocols,
+            recordings=tuple(named)
+            or make_recordings(chosen, scene_seeds, out / "sequences", make),
+            methods=compared,
+            protocols=all_values(protocols) or chosen.protocols,
             settings=settings,
-            search_seeds=search_seeds,
+            search_seeds=fit_seeds,
             device=str(environment.get("device", alone)),
             command=_command(
-                suite, {**given, "sequences": sequences}, jobs, ",".join(devices), server.engine
+                suite, {**given, "sequences": folders}, jobs, ",".join(devices), server.engine
             ),
             at_once=jobs,
             environment=environment,
@@ -175,6 +174,21 @@ def _checked_jobs(jobs: int | None, places: int, *, is_here: bool) -> int:
     if not 1 <= jobs <= most:
         raise UsageError(f"--jobs {jobs} makes no sense; choose 1 to {most}.")
     return jobs
+
+
+def _check_methods(
+    methods: Iterable[str], search_seeds: tuple[int, ...], settings: Mapping[str, Any]
+) -> None:
+    """Tell a wrong method before a sequence is made, which takes long.
+
+    Raises:
+        UsageError: If one is unknown, or has a setting that there is not.
+    """
+    from physhandi.synthetic.suite.methods import method_settings, parse_method, searched_from
+
+    for method in methods:
+        for one in searched_from(parse_method(method), search_seeds):
+            method_settings(one, settings)
 
 
 def _with_splats(settings: Mapping[str, Any], count: int | None) -> dict[str, Any]:

@@ -5,13 +5,13 @@ import shutil
 import socket
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
-from command_line_page import PAGE, page
+from command_line_page import PAGE, bare, commands, is_positional, page
 from server_world import tiny_config
-from sheet_sequence import FRAMES, NODE
+from sheet_sequence import FRAMES, NODE, write_sheet
 
 from app import cli
 from app.cli import runs
@@ -256,6 +256,29 @@ def test_a_run_is_simulated_again_with_other_parameters(terminal: Terminal) -> N
     assert np.abs(run.array("sequences/sheet/rollout.npy") - fitted).max() > 1e-5
 
 
+def test_a_run_is_simulated_in_several_recordings_each_moved_by_its_own_hands(
+    terminal: Terminal, tmp_path: Path
+) -> None:
+    sequences = terminal.data_dir / "sequences"
+    write_sheet(sequences / "higher", lift=0.2)
+    namesake = write_sheet(tmp_path / "elsewhere" / "sheet", lift=0.2).folder
+    order = ("simulate", "fitted", "--device", "cpu", "--out")
+    assert terminal(*order, "both", "--sequence", "sheet", "higher") == 0
+    assert terminal(*order, "namesakes", "--sequence", namesake, "--sequence", "higher") == 0
+    for out, first in (("both", sequences / "sheet"), ("namesakes", namesake)):
+        run = Run.open(out)
+        assert run.sequence_names == ["sheet", "higher"]
+        for folder in (first, sequences / "higher"):
+            control = run.array(f"sequences/{folder.name}/control.npy")
+            np.testing.assert_array_equal(control, np.load(folder / "control.npy"))
+    own, other = Run.open("both").metrics, Run.open("namesakes").metrics
+    assert other["higher"] == own["higher"]
+    # The namesake is the higher lift under the name of the run's own recording.
+    assert other["sheet"] == own["higher"]
+    assert own["sheet"]["future"]["rollout"]["track_error"] > 0
+    assert own["sheet"]["future"] != own["higher"]["future"]
+
+
 def test_a_run_is_simulated_again_with_edits_of_a_file(terminal: Terminal, tmp_path) -> None:
     file = tmp_path / "edits.json"
     file.write_text('[{"kind": "cut", "springs": [[0, 1], [1, 2]]}]')
@@ -453,6 +476,19 @@ def test_a_sequence_is_found_by_name_without_opening_all_others(
     assert set(opened) == {"sheet"}
     assert "Known are: sheet, " in terminal.refused(2, "reconstruct", "nowhere")
     assert len(set(opened)) > 1
+
+
+def test_an_option_that_takes_several_values_may_be_given_several_times() -> None:
+    lists = [
+        (f"{words} --{name}", get_origin(get_args(bare(hint))[0]))
+        for words, command in commands(cli.build())
+        for name, hint in get_type_hints(command, include_extras=True).items()
+        if get_origin(bare(hint)) is tuple and not is_positional(hint)
+    ]
+    assert len(lists) > 15
+    plain = [place for place, inner in lists if inner is not tuple]
+    # Each --set takes one setting, so that a sequence may follow it.
+    assert plain == ["reconstruct --settings"]
 
 
 def test_the_page_of_the_command_line_tells_what_the_commands_take() -> None:

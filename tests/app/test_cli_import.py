@@ -87,6 +87,8 @@ def test_every_option_of_a_motion_capture_import_can_be_given(tmp_path, capsys):
     command = ("import", "mocap", tmp_path / "rope.npy", "--out", tmp_path / "out")
     code, _, error = call(capsys, *command)
     assert (code, "--controlled-markers" in error) == (1, True)
+    code, _, error = call(capsys, *command, "--controlled-markers")
+    assert (code, "markers []" in error) == (1, True)
     options = ("--controlled-markers", 0, 4, "--recording-rate", 60, "--frame-rate", 20)
     options += ("--node-spacing", 0.02, "--rest-shape", "first_frame", "--up", "y", "--unit", "mm")
     code, _, error = call(capsys, *command, *options)
@@ -104,7 +106,8 @@ def test_a_raw_recording_is_imported_and_what_was_assumed_is_told(tmp_path, caps
     code, out, error = call(
         capsys,
         *("import", "capture", raw.folder, "--out", tmp_path / "ball"),
-        *("--depth-scale", 0.001, "--frame-rate", 20, "--every", 2, "--hands", "left", "right"),
+        *("--depth-scale", 0.001, "--frame-rate", 20, "--every", 2, "--hands", "left"),
+        *("--hands", "right"),
     )
     assert code == 0, error
     sequence = Sequence.load(tmp_path / "ball")

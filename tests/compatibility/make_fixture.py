@@ -35,7 +35,7 @@ from pydantic import SecretStr
 from app import cli, commands, permalink
 from app.arguments import Reconstruct
 from app.benchmarks.viewer_client import ViewerClient
-from app.comparison import CompareAsk
+from app.viewer.compare.request import CompareAsk
 from app.exports.links import address
 from app.jobs import listing, run_index
 from app.jobs.catalog import Catalog

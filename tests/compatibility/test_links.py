@@ -9,8 +9,8 @@ import numpy as np
 from old_data import SAME_MOTION_M, OldFolder, command, differences
 from server_world import World
 
-from app.comparison import CompareAsk
 from app.exports.permalink import state_from_query, state_to_query
+from app.viewer.compare.request import CompareAsk
 from app.viewer.content.session_state import SessionState
 
 

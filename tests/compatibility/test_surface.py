@@ -24,12 +24,12 @@ from starlette.testclient import TestClient
 from viewer_client import ViewerClient
 
 from app import cli
-from app.comparison import CompareAsk
 from app.exports.permalink import state_from_query
 from app.jobs.catalog import Catalog
 from app.keys import KEYS
 from app.server import create_app
 from app.settings import ServerSettings
+from app.viewer.compare.request import CompareAsk
 from app.viewer.physics.presets import builtin_presets
 from physhandi import pipeline
 from physhandi.errors import UsageError

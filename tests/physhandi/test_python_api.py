@@ -62,6 +62,21 @@ def test_importing_it_loads_neither_torch_nor_warp() -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_looking_at_recordings_and_results_loads_neither_torch_nor_warp(
+    run: ph.Run, recordings: Path
+) -> None:
+    code = (
+        "import sys, physhandi as ph\n"
+        f"print(ph.load({str(recordings / 'towel_fold')!r}).frame_count)\n"
+        f"print(ph.open_run({str(run.folder)!r}).metrics['towel_fold']['future'] != {{}})\n"
+        "print(sorted({'torch', 'warp', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, encoding="utf-8"
+    )
+    assert done.stdout.split("\n")[:3] == [str(FRAMES), "True", "[]"]
+
+
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(AttributeError, match="no attribute 'reconstrict'"):
         _ = ph.reconstrict  # type: ignore[attr-defined]  # it is not there

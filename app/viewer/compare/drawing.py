@@ -10,12 +10,12 @@ import viser
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from app.comparison import Mode, Tint
 from app.viewer.color.coloring import Painted
 from app.viewer.color.difference import Way, rollout_difference
 from app.viewer.color.legend import ColorScale
 from app.viewer.color.quantities import QUANTITIES, Values, from_nodes, in_length_unit
 from app.viewer.compare.camera import Box, Eye
+from app.viewer.compare.request import Mode, Tint
 from app.viewer.compare.sides import SIDE_KEYS, ComparedSide, Sides
 from app.viewer.content.content import Content
 from app.viewer.content.layers import (

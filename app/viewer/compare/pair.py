@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from app.comparison import CompareAsk
 from app.viewer.compare.curve import Pairing
+from app.viewer.compare.request import CompareAsk
 from app.viewer.content.content import Content, ContentSource, open_run_content
 from physhandi.data.layout import SequenceFiles
 from physhandi.errors import UsageError

@@ -7,7 +7,6 @@ from typing import Any
 
 import viser
 
-from app.comparison import Mode
 from app.viewer.color.legend import Legend, legend_html, swatches_html
 from app.viewer.compare.curve import DifferenceCurve
 from app.viewer.compare.drawing import (
@@ -18,6 +17,7 @@ from app.viewer.compare.drawing import (
     Look,
     difference_scale,
 )
+from app.viewer.compare.request import Mode
 from app.viewer.compare.sides import SIDE_KEYS
 from app.viewer.ui.guard import Guard, without_markup
 from app.viewer.ui.keyboard import bind

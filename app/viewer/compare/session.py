@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import viser
 
-from app.comparison import CompareAsk
 from app.viewer.clock.playback import TURN, Playback
 from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.compare.camera import ComparisonCameras
 from app.viewer.compare.drawing import Look
 from app.viewer.compare.pair import open_pair, pairing_of
+from app.viewer.compare.request import CompareAsk
 from app.viewer.compare.sides import SIDE_KEYS, ComparedSide, Sides, compared_rollouts
 from app.viewer.compare.view import CompareView
 from app.viewer.content.content import Content, ContentSource

@@ -10,9 +10,9 @@ import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, hear_all, make_run
 
-from app.comparison import CompareAsk
 from app.viewer.compare.drawing import GHOST
 from app.viewer.compare.pair import open_pair
+from app.viewer.compare.request import CompareAsk
 from app.viewer.compare.sides import ComparedSide, compared_rollouts
 from app.viewer.export.snapshot import snapshot_npz
 from app.viewer.scene.nodes import Plane

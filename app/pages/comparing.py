@@ -5,7 +5,6 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 
-from app.comparison import CompareAsk
 from app.ids import ItemId
 from app.jobs.catalog import Catalog, RunItem
 from app.jobs.scheduler import Scheduler
@@ -15,6 +14,7 @@ from app.pages.diff import compare_runs
 from app.viewer.color.difference import compare_frames, way_of
 from app.viewer.compare.curve import Pairing
 from app.viewer.compare.pair import chosen_sequences, open_pair, pairing_of
+from app.viewer.compare.request import CompareAsk
 from physhandi.data.files import named_fields
 from physhandi.errors import RunError
 from physhandi.run import Run
