@@ -53,6 +53,11 @@ _WHOLE = -1
 """Stored reach of gradients that were never too steep."""
 logger = logging.getLogger(__name__)
 
+_NOT_HELD = (
+    "Rest lengths that hold the object still at first make it diverge, so it begins with those "
+    "that the search judged."
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class FirstOrderResult:
@@ -107,13 +112,8 @@ def optimise_springs(
     if settings.truncates_damping:
         parameters = _truncated(parameters)
     problems = [problem.on(device) for problem in problems]
-    models = _starting_models(problems, parameters, config)
-    parameters = _with_margin(list(models.values()), parameters, config, device)
+    models, parameters, loss_before = _first_models(problems, parameters, config, device, progress)
     material = Material(models, parameters, settings)
-    loss_before = _finite(
-        mean_loss(problems, models, parameters, config, device),
-        "The searched parameters diverge; raise substeps_per_frame in the profile.",
-    )
     course = _Course(models, parameters, loss_before, is_candidate=not settings.judges_online)
     descent = SpringDescent(material, parameters, config, device)
     checkpointer = checkpointer or Checkpointer()
@@ -235,14 +235,38 @@ def _settled(
     return replace(result, parameters=parameters, loss_after=loss)
 
 
+def _first_models(
+    problems: Many[ObjectProblem],
+    searched: SimulationParameters,
+    config: ObjectFitConfig,
+    device: str,
+    progress: Progress,
+) -> tuple[dict[str, SpringMassModel], SimulationParameters, float]:
+    """Give the models to begin with, their parameters with enough substeps, and their loss.
+
+    The search judges springs as long as they were seen. With rest lengths that hold the object
+    still a part of it may fall farther before a hand catches it, which can tear it apart.
+    """
+    for holds_still in (True, False) if config.holds_still else (False,):
+        models = _starting_models(problems, searched, holds_still=holds_still)
+        parameters = _with_margin(list(models.values()), searched, config, device)
+        loss = mean_loss(problems, models, parameters, config, device)
+        if math.isfinite(loss):
+            return models, parameters, loss
+        if holds_still:
+            logger.warning("%s: %s", SPRING_STAGE, _NOT_HELD)
+            progress.report(SPRING_STAGE, 0, config.first_order.iterations, None, _NOT_HELD)
+    raise FitError("The searched parameters diverge; raise substeps_per_frame in the profile.")
+
+
 def _starting_models(
-    problems: Many[ObjectProblem], parameters: SimulationParameters, config: ObjectFitConfig
+    problems: Many[ObjectProblem], parameters: SimulationParameters, *, holds_still: bool
 ) -> dict[str, SpringMassModel]:
     """Build every sequence's springs; the object's own have the same rest lengths in all."""
     models: dict[str, SpringMassModel] = {}
     for problem in problems:
         model = build_problem_model(problem, parameters)
-        if config.holds_still:
+        if holds_still:
             if models:
                 first = next(iter(models.values()))
                 own = first.rest_length[: first.object_spring_count]

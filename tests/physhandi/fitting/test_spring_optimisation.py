@@ -24,6 +24,7 @@ from physhandi.fitting.spring_optimisation import (
     optimise_springs,
 )
 from physhandi.progress import NullProgress
+from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
 FRAMES = 4
@@ -98,6 +99,26 @@ def test_damping_and_drag_lose_their_fraction_only_if_asked_for() -> None:
     kept = optimise_springs([problem], PARAMETERS, config(), NullProgress())
     assert (kept.parameters.damping, kept.parameters.drag) == (83.97, 2.99)
     assert kept.loss_before != pytest.approx(expected, rel=1e-3)
+
+
+def test_what_cannot_be_held_still_begins_as_the_search_judged_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    problem, told = sliding_pair(0.3), []
+
+    def torn(model: SpringMassModel, *_: object, **__: object) -> SpringMassModel:
+        return replace(model, rest_length=1e-3 * model.rest_length)
+
+    monkeypatch.setattr(spring_optimisation, "hold_still", torn)
+    monkeypatch.setattr(NullProgress, "report", lambda *report: told.append(report[-1]))
+    searched = optimise_springs([problem], PARAMETERS, config(), NullProgress())
+    assert searched.loss_before > 0.0
+    assert told == [""]
+    held = config().replace(holds_still=True)
+    result = optimise_springs([problem], PARAMETERS, held, NullProgress())
+    assert (result.loss_before, result.loss_after) == (searched.loss_before, searched.loss_after)
+    assert "hold the object still" in told[1]
+    assert told[1] in caplog.messages[0]
 
 
 def returned_iteration(
