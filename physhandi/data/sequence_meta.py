@@ -14,7 +14,7 @@ from physhandi.errors import SequenceError
 
 FORMAT = "physhandi-sequence/1"
 UNFINISHED = "unfinished"
-"""What provenance says of masks while they are being stored."""
+"""Provenance field of masks that are being stored."""
 FILE = "sequence.yaml"
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _SIZE_LIMIT = 4_000_000

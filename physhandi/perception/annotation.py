@@ -49,10 +49,8 @@ LENGTHS_ALONG = "lengths along it from its ends"
 """Method of tracks of a thin object in the provenance."""
 _HASH = "model_sha256"
 """Provenance field of masks and tracks that a model of the user made here."""
-_UNFINISHED = "unfinished"
-"""Provenance field of masks that are being stored."""
 _CORRECTIONS = "corrections"
-"""What it calls the masks that somebody painted."""
+"""Provenance field of masks that somebody painted."""
 _TRACK_FILES = ("track.npy", "track_visible.npy")
 _FILES = ("mask", *_TRACK_FILES)
 
