@@ -83,6 +83,46 @@ _LONGEST_SILENCE_S = 60.0
 """Time after which a line is printed although no further quarter is done [s]."""
 
 
+class ToldProgress(Progress):
+    """Hands reports on, not more often than anybody can read; the end of a stage always.
+
+    What a child process tells its parent by (`physhandi.child.Channel.tell`).
+    """
+
+    def __init__(
+        self,
+        tell: Callable[..., None],
+        least_pause_s: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Hand on the first report at once.
+
+        Args:
+            tell: Is given ``stage``, ``iteration``, ``total`` and ``message`` by name.
+            least_pause_s: Time between two reports within a stage [s].
+            clock: Tells the time [s].
+        """
+        self._clock = clock
+        self._tell = tell
+        self._least_pause_s = least_pause_s
+        self._last = 0.0
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,  # noqa: ARG002
+        message: str = "",
+    ) -> None:
+        """Hand it on, if it is time; see `Progress.report`."""
+        now = self._clock()
+        if iteration >= total or now - self._last >= self._least_pause_s:
+            self._last = now
+            self._tell(stage=stage, iteration=iteration, total=total, message=message)
+
+
 class PrintedProgress(Progress):
     """Shows the running stage on standard error: a bar on a terminal, else lines.
 
@@ -90,14 +130,21 @@ class PrintedProgress(Progress):
     """
 
     def __init__(
-        self, stream: TextIO | None = None, *, clock: Callable[[], float] = time.monotonic
+        self,
+        stream: TextIO | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        has_bar: bool = True,
     ) -> None:
         """Show nothing until the first report.
 
         Args:
             stream: Where to; standard error if left out.
             clock: Tells the time [s].
+            has_bar: Whether there is a bar on a terminal; several at a time would overwrite each
+                other.
         """
+        self._has_bar = has_bar
         self._clock = clock
         self._line_time = 0.0
         self._stream = sys.stderr if stream is None else stream
@@ -117,7 +164,7 @@ class PrintedProgress(Progress):
         """Show a report; see `Progress.report`."""
         words = [] if loss is None else [f"loss {loss:.6g}"]
         text = "  ".join([*words, message] if message else words)
-        if self._stream.isatty():
+        if self._has_bar and self._stream.isatty():
             self._draw(stage, iteration, total, text)
         else:
             self._write(stage, iteration, total, text, message)

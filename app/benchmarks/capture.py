@@ -29,7 +29,7 @@ from physhandi.data.sequence_meta import FILE
 from physhandi.data.truth import read_truth
 from physhandi.data.view import View
 from physhandi.errors import CancelledError, PhysHandiError, RunError, UsageError, describe
-from physhandi.progress import PrintedProgress, Progress
+from physhandi.progress import PrintedProgress, Progress, ToldProgress
 
 CAPTURE_GOALS: Mapping[str, float] = {
     "object_iou": 0.85,
@@ -136,7 +136,9 @@ def benchmark_capture(
                     result["scenes"][scene] = work.result()
                 except (PhysHandiError, OSError) as error:
                     result["failed"][scene] = describe(error)
-                    _Lines().report(f"{scene}: failed: {describe(error)}", 0, 0)
+                    PrintedProgress(has_bar=False).report(
+                        f"{scene}: failed: {describe(error)}", 0, 0
+                    )
         except BaseException:
             steps.end()
             pool.shutdown(wait=False, cancel_futures=True)
@@ -194,7 +196,7 @@ class _Steps:
         Raises:
             PhysHandiError: If it failed; says of which scene and step.
         """
-        lines = _Lines()
+        lines = PrintedProgress(has_bar=False)
         label = " ".join(str(about[name]) for name in ("given", "search_seed") if name in about)
         label = f"{step} {label}".rstrip()
         lines.report(f"{scene}: {label}", 0, 0)
@@ -230,21 +232,6 @@ class _Steps:
             self._is_ended = True
             for child in self._children:
                 child.kill()
-
-
-class _Lines(PrintedProgress):
-    """Prints lines also on a terminal, where bars of several scenes would overwrite each other."""
-
-    def report(
-        self,
-        stage: str,
-        iteration: int,
-        total: int,
-        loss: float | None = None,
-        message: str = "",
-    ) -> None:
-        text = "" if loss is None else f"loss {loss:.6g}"
-        self._write(stage, iteration, total, text, message)
 
 
 def _measured(scene: str, folder: Path, order: CaptureOrder, steps: _Steps) -> dict[str, Any]:
@@ -555,30 +542,10 @@ def _in_mm(value: float | None) -> float | None:
     return None if value is None else _MILLIMETRES * value
 
 
-class _ToldProgress(Progress):
-    """Tells the parent how far a step is, at the end of a stage and a few times a second."""
-
-    def __init__(self, channel: Channel) -> None:
-        self._channel = channel
-        self._last = 0.0
-
-    def report(
-        self,
-        stage: str,
-        iteration: int,
-        total: int,
-        loss: float | None = None,  # noqa: ARG002
-        message: str = "",  # noqa: ARG002
-    ) -> None:
-        if iteration >= total or time.monotonic() - self._last >= _TELL_EVERY_S:
-            self._last = time.monotonic()
-            self._channel.tell(stage=stage, iteration=iteration, total=total)
-
-
 def _work(channel: Channel) -> None:
     """Do one step of a scene."""
     about: dict[str, Any] = json.loads(channel.arguments[0])
-    progress = _ToldProgress(channel)
+    progress = ToldProgress(channel.tell, _TELL_EVERY_S)
     fields = about["order"] | {"search_seeds": tuple(about["order"]["search_seeds"])}
     order = CaptureOrder(**fields)
     scene = about["scene"]

@@ -7,7 +7,6 @@ import itertools
 import os
 import queue
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Many
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,7 +20,7 @@ from app.jobs.ticket import MOST_STARTS
 from physhandi.child import Channel, Child, ChildEndedError, run_child
 from physhandi.devices import card_of, only_card
 from physhandi.errors import CancelledError
-from physhandi.progress import Progress
+from physhandi.progress import Progress, ToldProgress
 
 if TYPE_CHECKING:
     from physhandi.synthetic.suite.evaluation import Fill, Order
@@ -214,31 +213,11 @@ def _shares(count: int) -> list[list[int]]:
     ]
 
 
-class _ToldProgress(Progress):
-    """Tells the parent how far the work is, a few times a second."""
-
-    def __init__(self, channel: Channel) -> None:
-        self._channel = channel
-        self._last = 0.0
-
-    def report(
-        self,
-        stage: str,
-        iteration: int,
-        total: int,
-        loss: float | None = None,  # noqa: ARG002
-        message: str = "",  # noqa: ARG002
-    ) -> None:
-        if total == 0 or time.monotonic() - self._last >= _TELL_EVERY_S:
-            self._last = time.monotonic()
-            self._channel.tell(stage=stage, iteration=iteration, total=total)
-
-
 def _work(channel: Channel) -> None:
     """Do what is asked for until nothing more is, on processors that no sibling uses."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {int(number) for number in channel.arguments[0].split(",")})
-    worker = PieceWorker(_ToldProgress(channel))
+    worker = PieceWorker(ToldProgress(channel.tell, _TELL_EVERY_S))
     for request in channel.requests():
         worker.do(request)
         channel.tell(done=True)

@@ -19,7 +19,7 @@ from physhandi.data.layout import SequenceFiles
 from physhandi.errors import MissingInputError, RunError, SequenceError, UsageError
 from physhandi.fitted_object import FittedObject
 from physhandi.object_rollout import ObjectRollout
-from physhandi.progress import NullProgress, PrintedProgress, watched
+from physhandi.progress import NullProgress, PrintedProgress, ToldProgress, watched
 from physhandi.simulation.edits import Cut, Pin, Release, ScaleMaterial, checked_edits
 
 SMALL = sheet_config(generations=3, population=6, iterations=3)
@@ -403,3 +403,20 @@ def test_progress_is_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> Non
     with watched(False) as silent:
         silent.report("search", 1, 2)
     assert "1/2" not in terminal.getvalue().rpartition("2/2")[2]
+    of_several = Terminal()
+    PrintedProgress(of_several, has_bar=False).report("search", 1, 2, loss=0.25)
+    assert of_several.getvalue() == "search 1/2  loss 0.25\n"
+
+
+def test_a_parent_is_told_a_few_times_a_second_and_of_each_stage_that_ends() -> None:
+    told: list[dict[str, object]] = []
+    now = iter([10.0, 10.4, 10.6, 10.7, 10.8])
+    progress = ToldProgress(lambda **report: told.append(report), 0.5, clock=lambda: next(now))
+    for iteration in (1, 2, 3, 4):
+        progress.report("search", iteration, 4, message=f"candidate {iteration}")
+    progress.report("waits", 0, 0)
+    assert [(one["stage"], one["iteration"]) for one in told] == [
+        *(("search", iteration) for iteration in (1, 3, 4)),
+        ("waits", 0),
+    ]
+    assert told[1] == {"stage": "search", "iteration": 3, "total": 4, "message": "candidate 3"}

@@ -2,37 +2,21 @@
 
 import os
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, NoReturn
 
 from physhandi.child import Channel, run_child
 from physhandi.errors import CancelledError
-from physhandi.progress import Progress
+from physhandi.progress import Progress, ToldProgress
 
 _POLITENESS = 5
 _LEAST_PAUSE_S = 0.2
 
 
-class _ReportedProgress(Progress):
+class _ReportedProgress(ToldProgress):
     def __init__(self, channel: Channel) -> None:
-        self._channel = channel
-        self._last = 0.0
+        super().__init__(channel.tell, _LEAST_PAUSE_S)
         self.is_cancelled = threading.Event()
-
-    def report(
-        self,
-        stage: str,
-        iteration: int,
-        total: int,
-        loss: float | None = None,  # noqa: ARG002  # such work has none
-        message: str = "",
-    ) -> None:
-        """Tell it, but not more often than anybody can read."""
-        now = time.monotonic()
-        if now - self._last >= _LEAST_PAUSE_S or iteration == total:
-            self._last = now
-            self._channel.tell(stage=stage, iteration=iteration, total=total, message=message)
 
     def check_cancelled(self) -> None:
         """Stop if the server asked for it."""
