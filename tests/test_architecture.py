@@ -48,12 +48,19 @@ def _look_for_no_garbage() -> Iterator[None]:
     gc.disable()
     yield
     tree.cache_clear()
+    all_nodes.cache_clear()
     gc.enable()
 
 
 @cache
 def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
+
+
+@cache
+def all_nodes(path: Path) -> tuple[ast.AST, ...]:
+    """Walk a module once; that takes longer than parsing it."""
+    return tuple(ast.walk(tree(path)))
 
 
 def place(path: Path, node: ast.AST | None = None) -> str:
@@ -63,7 +70,7 @@ def place(path: Path, node: ast.AST | None = None) -> str:
 
 def nodes(files: Iterable[Path], kind: type[Node]) -> Iterator[tuple[Path, Node]]:
     for path in files:
-        for node in ast.walk(tree(path)):
+        for node in all_nodes(path):
             if isinstance(node, kind):
                 yield path, node
 
@@ -140,7 +147,7 @@ def test_kernels_write_only_to_outputs() -> None:
 def spoken(path: Path) -> Iterator[ast.AST]:
     """Where a module writes to standard output or standard error, whatever the way."""
     kinds = ast.Call | ast.Attribute | ast.ImportFrom
-    for node in (node for node in ast.walk(tree(path)) if isinstance(node, kinds)):
+    for node in (node for node in all_nodes(path) if isinstance(node, kinds)):
         match node:
             case ast.Call(func=ast.Name("print" | "input")):
                 yield node
@@ -204,7 +211,7 @@ def imported_modules(path: Path) -> set[str]:
     What a package's `__init__` imports inside functions is left out: these are doors to what
     stands above, opened for whoever calls them.
     """
-    top = tree(path).body if path.name == "__init__.py" else ast.walk(tree(path))
+    top = tree(path).body if path.name == "__init__.py" else all_nodes(path)
     found: set[str] = set()
     for node in top:
         if isinstance(node, ast.Import):
@@ -273,7 +280,7 @@ def test_a_public_name_has_one_meaning() -> None:
 
 def named_values(path: Path) -> Iterator[tuple[ast.AST, str]]:
     """Variables, parameters and attributes, each where it gets a value or is declared."""
-    for node in ast.walk(tree(path)):
+    for node in all_nodes(path):
         if isinstance(node, ast.arg):
             yield node, node.arg
         elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
