@@ -35,7 +35,7 @@ import numpy as np
 def play(folder=Path(__file__).parent):
     """Yield the object's nodes (node 3) [m] of frame after frame."""
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
-    motion = np.load(folder / "motion.npz")
+    motion = dict(np.load(folder / "motion.npz"))  # Else each use reads the file.
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     node, control = motion["node"], motion["control"]

@@ -78,7 +78,7 @@ def build(folder=Path(__file__).parent):
 
 def play(folder=Path(__file__).parent):
     """Yield the object's nodes (node 3) [m] of frame after frame."""
-    motion = np.load(folder / "motion.npz")
+    motion = dict(np.load(folder / "motion.npz"))  # Else each use reads the file.
     model, contacts = build(folder)
     model.particle_grid = None  # Nodes touch the ground, not each other.
     solver = newton.solvers.SolverSemiImplicit(model)

@@ -1,5 +1,6 @@
 """A painted rope on a spotted table, filmed from above: where each part of it is, is known."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -112,6 +113,17 @@ def film(
     return write_sequence(folder, meta, {}, images=images), {"top": label}
 
 
+@pytest.fixture(scope="module")
+def rope(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sequence, dict[str, np.ndarray]]:
+    """The film that tests share, which none of them changes."""
+    return film(tmp_path_factory.mktemp("film") / "rope")
+
+
+@pytest.fixture(scope="module")
+def followed(rope: tuple[Sequence, dict[str, np.ndarray]]) -> tuple[PixelTracks, str]:
+    return follow(*rope)
+
+
 def follow(sequence: Sequence, labels: dict[str, np.ndarray]) -> tuple[PixelTracks, str]:
     assert is_thin(labels)
     return thin_tracks(sequence.views, labels, sequence.frame_rate, NullProgress())
@@ -139,10 +151,10 @@ def slip(
     return away[is_seen & (age > 0)], age[is_seen & (age > 0)]
 
 
-def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(tmp_path):
+def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(rope, followed):
     """It is drawn by 31 px in all; flow lags, as what is beside the rope stays."""
-    sequence, labels = film(tmp_path / "rope")
-    tracks, trouble = follow(sequence, labels)
+    sequence, labels = rope
+    tracks, trouble = followed
     assert trouble == ""
     pixel, is_seen = tracks["top"]
     assert pixel.dtype == np.float32
@@ -159,8 +171,8 @@ def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(tmp
     assert np.median(lagging[old >= 10]) < -3.0
 
 
-def test_points_lie_where_depth_lifts_them(tmp_path, monkeypatch):
-    sequence, labels = film(tmp_path / "rope")
+def test_points_lie_where_depth_lifts_them(rope, monkeypatch):
+    sequence, labels = rope
     view = sequence.views[0]
     read, holes = type(view).depth, np.random.default_rng(2)
     depth = [read(view, f) * (holes.random((HEIGHT, WIDTH)) > 0.15) for f in range(FRAMES)]
@@ -211,9 +223,10 @@ def test_a_rope_whose_lengths_are_not_known_gets_no_such_tracks(tmp_path, how, w
     assert why in trouble
 
 
-def test_corrected_masks_give_a_rope_tracks_along_it_and_say_so(tmp_path):
-    sequence, labels = film(tmp_path / "rope")
-    done = correct_masks(sequence.folder, [Correction("top", 3, labels["top"][3])])
+def test_corrected_masks_give_a_rope_tracks_along_it_and_say_so(rope, followed, tmp_path):
+    sequence, labels = rope
+    folder = shutil.copytree(sequence.folder, tmp_path / "rope")
+    done = correct_masks(folder, [Correction("top", 3, labels["top"][3])])
     assert done.provenance["tracks"] == {
         "source": "built-in",
         "method": "lengths along it from its ends",
@@ -221,7 +234,7 @@ def test_corrected_masks_give_a_rope_tracks_along_it_and_say_so(tmp_path):
     pixel, is_seen = done.views[0].track, done.views[0].track_visible
     assert pixel is not None
     assert is_seen is not None
-    expected, _ = follow(sequence, labels)
+    expected, _ = followed
     np.testing.assert_array_equal(pixel, expected["top"][0])
     np.testing.assert_array_equal(is_seen, expected["top"][1])
 
