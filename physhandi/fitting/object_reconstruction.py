@@ -49,6 +49,9 @@ from physhandi.simulation.topology import MINIMUM_LENGTH
 logger = logging.getLogger(__name__)
 _DIGEST = 16
 """Bytes by which a candidate is told from others."""
+CATCHING_SPEED = 1000.0
+"""Speed from which nodes count as diverged where all candidates exceed the usual one [m/s]. Springs
+of millimetres that take hold of a node centimetres away move it at 200 m/s, and are stable."""
 
 
 def search_object(
@@ -96,7 +99,13 @@ def search_object(
         more_devices=more_devices,
         known_losses=known_losses,
     )
-    return search_parameters(evaluate, start, search, _ResumedSearch(progress, known_losses))
+    progress = _ResumedSearch(progress, known_losses)
+    try:
+        return search_parameters(evaluate, start, search, progress)
+    except FitError:
+        if start.speed_limit >= CATCHING_SPEED:
+            raise
+    return search_parameters(evaluate, start.replace(speed_limit=CATCHING_SPEED), search, progress)
 
 
 class _KnownLosses:

@@ -347,6 +347,12 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
         ),
     ] = False
     """Whether nodes collide that are nearer than `collision_distance` at frame 0 (PhysTwin)."""
+    speed_limit: Annotated[
+        float,
+        Meta(ge=1e-3, le=1e6),
+        Role(label="speed limit", is_length=True, is_searched=False),
+    ] = 50.0
+    """A node faster than this counts as diverged [m/s]."""
 
     def __post_init__(self) -> None:
         """Check the values; see `Settings.__post_init__`."""

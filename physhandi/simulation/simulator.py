@@ -16,7 +16,7 @@ from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.cuda import CudaEngine
 from physhandi.simulation.engines.graph import LaunchGraph, SpringSums
 from physhandi.simulation.engines.rod_force import RodForce
-from physhandi.simulation.kernels.integration import SPEED_LIMIT, integrate_nodes
+from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SpringMassModel, checked_control
@@ -191,7 +191,7 @@ class Simulator:
             control_end: Where they are at the end [m].
 
         Raises:
-            SimulationDivergedError: If a node is not finite or faster than `SPEED_LIMIT`.
+            SimulationDivergedError: If a node is not finite or faster than `speed_limit`.
         """
         if self.model.control_count:
             self.control_start.assign(np.ascontiguousarray(control_start, dtype=np.float32))
@@ -229,7 +229,7 @@ class Simulator:
             Frame, positions [m] and velocities [m/s]; frame 0 is the initial state.
 
         Raises:
-            SimulationDivergedError: If a node is not finite or faster than `SPEED_LIMIT`.
+            SimulationDivergedError: If a node is not finite or faster than `speed_limit`.
             ValueError: If the control nodes or the restart do not fit the model.
         """
         control = self.checked_control(control)
@@ -385,7 +385,7 @@ class Simulator:
         model = replace(self.model, **material)
         raise SimulationDivergedError(
             f"Simulation diverged at frame {frame}, substep {substep}: node {node} is not finite "
-            f"or faster than {SPEED_LIMIT:g} m/s. "
+            f"or faster than {self.parameters.speed_limit:g} m/s. "
             + explain_divergence(model, self.parameters, node),
             frame=frame,
             substep=substep,
@@ -427,6 +427,7 @@ def world_array(parameters: Sequence[SimulationParameters]) -> ndarray:
             "self_restitution": each.self_restitution,
             "self_friction": each.self_friction,
             "collides_rest_neighbors": each.collides_rest_neighbors,
+            "speed_limit": each.speed_limit,
         }
         for name, value in values.items():
             worlds[name][index] = value

@@ -22,6 +22,7 @@ CANDIDATE_FIELDS = (
     "restitution",
     "friction",
     "control_rate",
+    "speed_limit",
     "stiffness",
     "damping",
     "connection_radius",
@@ -343,11 +344,12 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             if touches_ground(here, touching, position, free):
                 here.restitution = load(number, numbers, wp.static(_row("restitution")))[i]
                 here.friction = load(number, numbers, wp.static(_row("friction")))[i]
+            here.speed_limit = load(number, numbers, wp.static(_row("speed_limit")))[i]
             motion = advance(here, touching, position, free)
             for k in range(3):
                 x[k, i] = motion.position[k]
                 v[k, i] = motion.velocity[k]
-            if is_too_fast(motion.velocity):
+            if is_too_fast(here, motion.velocity):
                 diverged_out[wp.static(count) * (32 * group + lane) + i] = 1
         for k in range(3):
             store(state_out, own, 32 * k, x[k])

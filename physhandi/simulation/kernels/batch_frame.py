@@ -462,6 +462,7 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
         height = kept_numbers(wp.static(_row("ground_height")) + 2 * pair)
         restitution = kept_numbers(wp.static(_row("restitution")) + 2 * pair)
         friction = kept_numbers(wp.static(_row("friction")) + 2 * pair)
+        fastest = kept_numbers(wp.static(_row("speed_limit")) + 2 * pair)
         for c in range(2):
             world = World()
             world.dt = dt[c]
@@ -471,6 +472,7 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
             world.ground_height = height[c]
             world.restitution = restitution[c]
             world.friction = friction[c]
+            world.speed_limit = fastest[c]
             total = wp.vec3(force[0, c], force[1, c], force[2, c])
             x = wp.vec3(here[0, c], here[1, c], here[2, c])
             v = wp.vec3(here[3, c], here[4, c], here[5, c])
@@ -478,7 +480,7 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
             for k in range(3):
                 here[k, c] = motion.position[k]
                 here[3 + k, c] = motion.velocity[k]
-            if is_too_fast(motion.velocity):
+            if is_too_fast(world, motion.velocity):
                 diverged_out[candidate + c] = 1
         return here
 

@@ -112,7 +112,7 @@ def move_nodes(
         state[next_row, node] = as_record(motion.position, motion.velocity)
         if free_tape.shape[0] > 0:
             free_tape[substep, node] = wp.vec4(free[0], free[1], free[2], 0.0)
-        if is_too_fast(motion.velocity):
+        if is_too_fast(world, motion.velocity):
             place = substep * count + parts.node[node]
             first_divergence[part] = wp.min(first_divergence[part], place)
 

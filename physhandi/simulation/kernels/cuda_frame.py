@@ -215,7 +215,7 @@ def make_frame_kernel(lanes: int, in_registers: int) -> wp.Kernel:
                         tape_out[substep, 3 * node] = wp.vec4(x[0], x[1], x[2], 0.0)
                         tape_out[substep, 3 * node + 1] = wp.vec4(v[0], v[1], v[2], 0.0)
                         tape_out[substep, 3 * node + 2] = wp.vec4(free[0], free[1], free[2], 0.0)
-                    if is_too_fast(motion.velocity):
+                    if is_too_fast(here, motion.velocity):
                         wp.atomic_min(
                             first_divergence_out, body, substep * count + model_node[node]
                         )

@@ -188,7 +188,7 @@ def make_large_frame_kernel(lanes: int, in_registers: int, threads: int, locals_
                     publish(relay_out, relay + 1, motion.velocity, tag + substep + 1)
                     large_write(later + i, motion.position)
                     large_write(later + wp.static(locals_) + i, motion.velocity)
-                    if is_too_fast(motion.velocity):
+                    if is_too_fast(here, motion.velocity):
                         wp.atomic_min(
                             first_divergence_out, body, substep * count + model_node[node]
                         )

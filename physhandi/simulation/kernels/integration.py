@@ -7,10 +7,6 @@ from physhandi.simulation.kernels.world import World
 
 wp.set_module_options({"enable_backward": False})
 
-SPEED_LIMIT = wp.constant(1000.0)
-"""A node faster than this has diverged [m/s]. What is unstable gets there within a few frames; what
-is stable can have 200 m/s, where springs of millimetres take hold of a node centimetres away."""
-
 
 @wp.func
 def spring_sum(
@@ -40,9 +36,9 @@ def free_velocity(world: World, velocity: wp.vec3, force: wp.vec3):
 
 
 @wp.func
-def is_too_fast(velocity: wp.vec3):
+def is_too_fast(world: World, velocity: wp.vec3):
     """Return whether a node has diverged; written so that NaN is caught too."""
-    return not (wp.length_sq(velocity) <= SPEED_LIMIT * SPEED_LIMIT)
+    return not (wp.length_sq(velocity) <= world.speed_limit * world.speed_limit)
 
 
 @wp.kernel
@@ -92,5 +88,5 @@ def integrate_nodes(
     if free_velocity_out.shape[0] > 0:
         free_velocity_out[node] = free
     # An integer minimum does not depend on thread order.
-    if is_too_fast(motion.velocity):
+    if is_too_fast(world[0], motion.velocity):
         wp.atomic_min(first_divergence_out, 0, substep * position.shape[0] + node)

@@ -22,3 +22,5 @@ class World:
     self_restitution: wp.float32
     self_friction: wp.float32
     collides_rest_neighbors: wp.int32
+    speed_limit: wp.float32
+    """A node that is faster has diverged [m/s]."""

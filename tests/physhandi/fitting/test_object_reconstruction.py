@@ -179,6 +179,26 @@ def test_search_improves_a_wrong_start() -> None:
     assert result.loss_after < 0.3 * result.loss_before
 
 
+def test_a_search_that_finds_nothing_slow_looks_for_what_is_fast_and_stable() -> None:
+    problems = [held_sheet("slow", 0.2)]
+    slow = PARAMETERS.replace(stiffness=2000.0, speed_limit=0.01)
+    found = search_object(problems, slow, config(), NullProgress())
+    assert found.parameters.speed_limit == 1000.0
+    # The same candidates as a search that was told so, and their substeps are as fine.
+    fast = search_object(problems, slow.replace(speed_limit=1000.0), config(), NullProgress())
+    assert found.parameters == fast.parameters
+    assert found.loss_after == fast.loss_after < np.inf
+    usual = search_object(problems, slow.replace(speed_limit=50.0), config(), NullProgress())
+    assert usual.parameters == fast.parameters.replace(speed_limit=50.0)
+    unstable = config().replace(automatic_substeps=False)
+    stiff = PARAMETERS.replace(stiffness=1e6, substeps_per_frame=1, speed_limit=0.01)
+    search = unstable.search.replace(
+        variables={"stiffness": SearchVariable(low=5e5, high=2e6, scale="log")}
+    )
+    with pytest.raises(FitError, match="candidates diverged"):
+        search_object(problems, stiff, unstable.replace(search=search), NullProgress())
+
+
 def test_objects_that_differ_are_refused() -> None:
     first, second = held_sheet("slow", 0.2), held_sheet("fast", 0.2)
     stretched = replace(second, rest_node=(NODE * [1.0, 2.5, 1.0]).astype(np.float32))

@@ -152,7 +152,7 @@ def test_the_simulator_diverges_beyond_the_step_and_not_before(device):
         rest=[0.5],
         stiffness=[100.0],
         damping=[1.0],
-        frames=800,
+        frames=400,
     )
     model, parameters = as_model(scene)
     step = largest_stable_step(model, parameters)

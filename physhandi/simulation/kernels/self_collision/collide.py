@@ -131,5 +131,5 @@ def collide_nodes(
     velocity_out[node] = motion.velocity
     if contact_velocity_out.shape[0] > 0:
         contact_velocity_out[node] = collided
-    if is_too_fast(motion.velocity):
+    if is_too_fast(world[0], motion.velocity):
         wp.atomic_min(first_divergence_out, 0, substep * position.shape[0] + node)
