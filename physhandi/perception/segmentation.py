@@ -107,6 +107,12 @@ _AROUND = 1.5
 
 _BRIDGE = 0.015
 """Pieces that are this near to a hand may hang together behind it [m]."""
+_LEAST_WIDTHS = 14.0
+"""Area of a long thin object in an image, in squares of its width."""
+_TOO_THICK = 1.5
+"""Thickness of what is hardly a part of it, in its widths."""
+_WIDEST = 16
+"""Width from which nothing is called thin [px]."""
 _LEAST_PIECE = 8
 """Pixels of the smallest piece that a hand may cut off."""
 _HAND_DEPTH = 0.09
@@ -1186,11 +1192,11 @@ def _begin(
         label = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
         if has_object:
             label = _hanging_together(seen, patch, label, seed)
+            label, unsure = _without_thick_hands(seen, patch, label)
             is_object = (label == OBJECT_LABEL) | seed
             # From a click, an object of several colors is found by what lies between them.
-            _learn_object(
-                colors, shadowed, _off_rim(seen, patch, is_object) if is_whole else is_object
-            )
+            sure = is_object & ~unsure
+            _learn_object(colors, shadowed, _off_rim(seen, patch, sure) if is_whole else sure)
             farness = _farness(seen, patch, is_object)
         for value, hand in hands.items():
             seen.things[value].replace(patch.code[hand.core & (label == value)])
@@ -1280,9 +1286,11 @@ def _advance(
     farness = _farness(seen, patch, anchor) if has_object else None
     labels, score = _judge(seen, patch, hands, farness, carried, has_object=has_object)
     inner = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
+    unsure = np.zeros(inner.shape, dtype=bool)
     if has_object:
         inner = _hanging_together(seen, patch, inner, anchor)
-    _learn(seen, patch, labels, score, inner)
+        inner, unsure = _without_thick_hands(seen, patch, inner)
+    _learn(seen, patch, labels, score, inner, unsure=unsure)
     result = np.zeros_like(label)
     result[window] = _outlined(patch, inner)
     return result
@@ -1294,8 +1302,10 @@ def _learn(
     labels: list[int],
     score: Float[ndarray, "label row column"],
     label: UInt8[ndarray, "row column"],
+    *,
+    unsure: Bool[ndarray, "row column"],
 ) -> None:
-    """Follow colors as light and sides of things change."""
+    """Follow colors as light and sides of things change, but for what is unsure of the object."""
     if len(labels) < 2:
         return
     ordered = np.sort(score, axis=0)
@@ -1304,7 +1314,9 @@ def _learn(
         rate = _OBJECT_RATE if value == OBJECT_LABEL else _SKIN_RATE
         seen.things[value].fade(_MEMORY * max(50, int((label == value).sum())))
         mine = label == value
-        of_thing = is_sure & (_off_rim(seen, patch, mine) if value == OBJECT_LABEL else mine)
+        if value == OBJECT_LABEL:
+            mine = _off_rim(seen, patch, mine & ~unsure)
+        of_thing = is_sure & mine
         seen.things[value].add(patch.code[of_thing], rate)
         if value == OBJECT_LABEL:
             for share in _SHADOWS[1:]:
@@ -1349,11 +1361,7 @@ def _hanging_together(
     hand = label > OBJECT_LABEL
     owner = np.zeros(count, dtype=np.uint8)
     if is_kept.any() and hand.any():
-        depth = patch.depth[hand & patch.has_depth]
-        reach = _BRIDGE * seen.focal / float(np.median(depth)) if depth.size else 3.0
-        touches, owner = _beside_hands(
-            seen, patch, label, piece, is_kept=is_kept, reach=max(1, round(reach))
-        )
+        touches, owner = _beside_hands(seen, patch, label, piece, is_kept=is_kept)
         if touches[is_kept].any():
             least = max(_LEAST_PIECE, 0.02 * float(stays.sum()))
             is_kept |= touches & (owner == _BACKGROUND) & (size >= least)
@@ -1363,6 +1371,59 @@ def _hanging_together(
     return np.where(is_object & ~stays, owner[piece], label)
 
 
+def _without_thick_hands(
+    seen: _Seen, patch: _Patch, label: UInt8[ndarray, "row column"]
+) -> tuple[UInt8[ndarray, "row column"], Bool[ndarray, "row column"]]:
+    """Give hands what is beside them and too thick for a long thin object, if it may be theirs.
+
+    What keypoints do not reach of a hand goes on in space from the rope that it holds. But a rope
+    is as thin beside a hand as elsewhere, unless it is wound there, which its colors tell.
+
+    Returns:
+        Labels, and what of a long thin object is too near to a hand, or too thick beside one, for
+        its colors to be learned: they may be the hand's, or those of its shadow.
+    """
+    mask = (label == OBJECT_LABEL).astype(np.uint8)
+    hands = np.unique(label[label > OBJECT_LABEL]).tolist()
+    width = _typical_width(mask) if hands else None
+    if width is None or mask.sum() < _LEAST_WIDTHS * width**2:
+        return label, np.zeros(label.shape, dtype=bool)
+    thick = _opened(mask, max(2, round(0.5 * (_TOO_THICK * width - 1.0))))
+    thick = mask & cv2.dilate(thick, _disc(round(0.5 * width) + 1))
+    count, piece = cv2.connectedComponents(thick)
+    owner, most = np.zeros_like(label), np.full(label.shape, -np.inf, dtype=np.float32)
+    near, unsure = _disc(_hand_reach(seen, patch, label)), np.zeros(label.shape, dtype=bool)
+    for value in hands:
+        beside = cv2.dilate((label == value).astype(np.uint8), near) > 0
+        density = seen.things[value].log_density(patch.code)
+        is_more = (np.bincount(piece[beside], minlength=count) > 0)[piece] & (density > most)
+        is_more &= thick > 0
+        owner[is_more], most[is_more] = value, density[is_more]
+        unsure |= beside | is_more
+    # What neither shows elsewhere, like shaded skin, is thick as a hand is.
+    own = seen.things[OBJECT_LABEL].log_density(patch.code)
+    return np.where((owner > 0) & (own <= np.maximum(most, 0.0)), owner, label), unsure
+
+
+def _typical_width(mask: UInt8[ndarray, "row column"]) -> float | None:
+    """Find the width that half of a mask is narrower than [px]; None from `_WIDEST` on."""
+    half = 0.5 * float(mask.sum())
+    area = 2.0 * half
+    for radius in range(1, _WIDEST // 2 if half else 1):
+        left = float(_opened(mask, radius).sum())
+        if left < half:
+            return 2.0 * (radius - 1 + (area - half) / (area - left)) + 1.0
+        area = left
+    return None
+
+
+def _opened(mask: UInt8[ndarray, "row column"], radius: int) -> UInt8[ndarray, "row column"]:
+    """Keep what discs of a radius fit into; what goes on beyond the image has room there."""
+    wide = cv2.copyMakeBorder(mask, *(radius,) * 4, cv2.BORDER_REPLICATE)
+    opened = cv2.morphologyEx(wide, cv2.MORPH_OPEN, _disc(radius))
+    return opened[radius:-radius, radius:-radius]
+
+
 def _beside_hands(
     seen: _Seen,
     patch: _Patch,
@@ -1370,7 +1431,6 @@ def _beside_hands(
     piece: Int[ndarray, "row column"],
     *,
     is_kept: Bool[ndarray, " piece"],
-    reach: int,
 ) -> tuple[Bool[ndarray, " piece"], UInt8[ndarray, " piece"]]:
     """Tell which pieces of the object are beside a hand, and which of these are its skin.
 
@@ -1380,19 +1440,19 @@ def _beside_hands(
         label: Labels.
         piece: Numbers of the object's pieces.
         is_kept: Pieces that are the object's.
-        reach: What is beside a hand is at most so far from it [px].
 
     Returns:
         Whether each piece is beside a hand; and the label of the hand whose colors it has rather
         than the object's, 0 of those that are the object's or no hand's.
     """
     is_object = label == OBJECT_LABEL
+    near = _disc(_hand_reach(seen, patch, label))
     is_asked = is_object & ~is_kept[piece]
     count = len(is_kept)
     touches, owner, most = np.zeros(count, bool), np.zeros(count, np.uint8), np.zeros(count)
     own = seen.things[OBJECT_LABEL].log_density(patch.code[is_asked])
     for value in np.unique(label[label > OBJECT_LABEL]).tolist():
-        beside = cv2.dilate((label == value).astype(np.uint8), _disc(reach)) > 0
+        beside = cv2.dilate((label == value).astype(np.uint8), near) > 0
         is_beside = np.bincount(piece[is_object & beside], minlength=count) > 0
         touches |= is_beside
         lead = seen.things[value].log_density(patch.code[is_asked]) - own
@@ -1400,6 +1460,12 @@ def _beside_hands(
         owner[is_beside & (lead > most)] = value
         most = np.where(is_beside, np.maximum(most, lead), most)
     return touches, owner
+
+
+def _hand_reach(seen: _Seen, patch: _Patch, label: UInt8[ndarray, "row column"]) -> int:
+    """Tell how far from a hand something is beside it [px]."""
+    depth = patch.depth[(label > OBJECT_LABEL) & patch.has_depth]
+    return max(1, round(_BRIDGE * seen.focal / float(np.median(depth)))) if depth.size else 3
 
 
 def _pieces(

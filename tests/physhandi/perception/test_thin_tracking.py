@@ -13,6 +13,7 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
+from physhandi.data.view import View
 from physhandi.perception import thin_tracking
 from physhandi.perception.annotation import Correction, correct_masks
 from physhandi.perception.point_tracking import PixelTracks, track_points
@@ -139,9 +140,14 @@ def slip(
     return away[is_seen & (age > 0)], age[is_seen & (age > 0)]
 
 
-def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(tmp_path):
+@pytest.fixture(scope="module")
+def rope(tmp_path_factory):
+    return film(tmp_path_factory.mktemp("thin") / "rope")
+
+
+def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(rope):
     """It is drawn by 31 px in all; flow lags, as what is beside the rope stays."""
-    sequence, labels = film(tmp_path / "rope")
+    sequence, labels = rope
     tracks, trouble = follow(sequence, labels)
     assert trouble == ""
     pixel, is_seen = tracks["top"]
@@ -150,7 +156,7 @@ def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(tmp
     for frame in range(FRAMES):
         column, row = pixel[frame, is_seen[frame]].round().astype(int).T
         assert (labels["top"][frame, row, column] == 1).all()
-    assert is_seen.sum(axis=1).min() >= 60
+    assert is_seen.sum(axis=1).min() >= 150
     away, age = slip(tracks)
     assert (age >= 10).sum() > 300
     assert np.median(np.abs(away[age >= 10])) < 0.7
@@ -159,8 +165,39 @@ def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(tmp
     assert np.median(lagging[old >= 10]) < -3.0
 
 
-def test_points_lie_where_depth_lifts_them(tmp_path, monkeypatch):
-    sequence, labels = film(tmp_path / "rope")
+def test_places_are_interpolated_where_no_line_is_found_but_the_object_is_seen(rope, monkeypatch):
+    sequence, labels = rope
+    view, find = sequence.views[0], thin_tracking.centre_lines
+    whole, _ = follow(sequence, labels)[0]["top"]
+    lacking, hole = {5, 9, 10, 11, 12}, 60
+    frames = iter(range(FRAMES))
+    monkeypatch.setattr(
+        thin_tracking,
+        "centre_lines",
+        lambda cloud, cell: () if next(frames) in lacking else find(cloud, cell),
+    )
+    monkeypatch.setattr(thin_tracking, "_MEASURED_FRAMES", 0.5)
+    read = type(view).depth
+
+    def depth(self: View, frame: int) -> np.ndarray:
+        image = np.array(read(self, frame))
+        image[:, :hole] *= frame != 5
+        return image
+
+    monkeypatch.setattr(type(view), "depth", depth)
+    pixel, is_seen = follow(sequence, labels)[0]["top"]
+    assert not is_seen[9:13].any()
+    assert is_seen[[8, 13]].any(axis=1).all()
+    assert pixel.shape == whole.shape
+    both = is_seen[5] & np.isfinite(whole[5]).all(axis=-1)
+    assert both.sum() > 100
+    assert np.linalg.norm(pixel[5] - whole[5], axis=-1)[both].max() < 1.0
+    assert np.nanmin(pixel[5, :, 0]) > hole - 2
+    assert np.nanmin(whole[5, :, 0]) < hole - 10
+
+
+def test_points_lie_where_depth_lifts_them(rope, monkeypatch):
+    sequence, labels = rope
     view = sequence.views[0]
     read, holes = type(view).depth, np.random.default_rng(2)
     depth = [read(view, f) * (holes.random((HEIGHT, WIDTH)) > 0.15) for f in range(FRAMES)]
