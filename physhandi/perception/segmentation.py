@@ -23,8 +23,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from physhandi.data.camera import triangulate
 from physhandi.data.sequence import Sequence
@@ -113,6 +114,18 @@ _TOO_THICK = 1.5
 """Thickness of what is hardly a part of it, in its widths."""
 _WIDEST = 16
 """Width from which nothing is called thin [px]."""
+_STRIP = 3.0
+"""Radius (standard deviation) in which the direction of a thin object is looked for [px]."""
+_LEAST_MIDDLE = 10
+"""Pixels in its middle from which its rims are looked for."""
+_WAY = np.arange(-8.0, 8.01, 0.25)
+"""Ways across it at which its color is looked at [px]."""
+_COLOR_ALONG, _EDGE_ALONG = 1.5, 5.0
+"""Radii in which colors, and their changes, are averaged along it [px]."""
+_TOO_WIDE, _RIM_ERROR = 0.3, 0.5
+"""How much too far out its rims are before, and by how much that varies [px]."""
+_LEAST_CHANGE = 2.0
+"""Change of color from which it is seen to have a rim there [levels of CIELAB a pixel]."""
 _LEAST_PIECE = 8
 """Pixels of the smallest piece that a hand may cut off."""
 _HAND_DEPTH = 0.09
@@ -1385,8 +1398,8 @@ def _without_thick_hands(
     """
     mask = (label == OBJECT_LABEL).astype(np.uint8)
     hands = np.unique(label[label > OBJECT_LABEL]).tolist()
-    width = _typical_width(mask) if hands else None
-    if width is None or mask.sum() < _LEAST_WIDTHS * width**2:
+    width = _width_of_thin(mask) if hands else None
+    if width is None:
         return label, np.zeros(label.shape, dtype=bool)
     thick = _opened(mask, max(2, round(0.5 * (_TOO_THICK * width - 1.0))))
     thick = mask & cv2.dilate(thick, _disc(round(0.5 * width) + 1))
@@ -1403,6 +1416,12 @@ def _without_thick_hands(
     # What neither shows elsewhere, like shaded skin, is thick as a hand is.
     own = seen.things[OBJECT_LABEL].log_density(patch.code)
     return np.where((owner > 0) & (own <= np.maximum(most, 0.0)), owner, label), unsure
+
+
+def _width_of_thin(mask: UInt8[ndarray, "row column"]) -> float | None:
+    """Find the width of a long thin object [px]; None of other things."""
+    width = _typical_width(mask)
+    return None if width is None or mask.sum() < _LEAST_WIDTHS * width**2 else width
 
 
 def _typical_width(mask: UInt8[ndarray, "row column"]) -> float | None:
@@ -1498,11 +1517,13 @@ def _pieces(
 
 
 def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarray, "row column"]:
-    """Let GrabCut decide the object's outermost pixels, where it is thick enough for it.
+    """Decide the object's outermost pixels, by GrabCut where it is thick enough for it.
 
     Its smoothness term would eat what is only a few pixels wide, like a rope.
     """
     mask = (label == OBJECT_LABEL).astype(np.uint8)
+    if _width_of_thin(mask) is not None:
+        return _outlined_along(patch, label)
     thick = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(3))
     sure = cv2.erode(thick, np.ones((3, 3), np.uint8))
     rim = (cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0) & (sure == 0)
@@ -1519,3 +1540,109 @@ def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarr
     is_object = (state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)
     result[free] = np.where(is_object[free], OBJECT_LABEL, _BACKGROUND)
     return result
+
+
+def _outlined_along(
+    patch: _Patch, label: UInt8[ndarray, "row column"]
+) -> UInt8[ndarray, "row column"]:
+    """Put the rims of a long thin object where hue and saturation change most, on average along it.
+
+    Videos keep color at half of their resolution, so the object's reaches a pixel farther than it
+    does, and pixels of which a fifth is the object's count as it. Lightness changes more across a
+    lit round thing than at its rims.
+    """
+    mask = label == OBJECT_LABEL
+    normal, off, width = _across(mask)
+    is_middle = mask & (np.abs(off) < 0.5)
+    row, column = np.nonzero(is_middle)
+    if len(row) < _LEAST_MIDDLE:
+        return label
+    normal, width = normal[is_middle], width[is_middle]
+    middle = np.stack([column, row], axis=1) - off[is_middle, None] * normal
+    pair = KDTree(middle).query_pairs(3 * _EDGE_ALONG, output_type="ndarray")
+    pair = np.concatenate([pair, pair[:, ::-1], np.arange(len(row))[:, None].repeat(2, axis=1)])
+    apart = np.linalg.norm(middle[pair[:, 0]] - middle[pair[:, 1]], axis=1)
+    is_turned = (normal[pair[:, 0]] * normal[pair[:, 1]]).sum(axis=1) < 0
+
+    def along(
+        value: Float[ndarray, "place value"], flipped: Float[ndarray, "place value"], radius: float
+    ) -> Float[ndarray, "place value"]:
+        """Average over places along it; where the direction across it is opposite, flipped ones."""
+        share = np.exp(-0.5 * (apart / radius) ** 2)
+        same, other = (
+            csr_array((share * part, (pair[:, 0], pair[:, 1])), shape=(len(row),) * 2)
+            for part in (~is_turned, is_turned)
+        )
+        return (same @ value + other @ flipped) / (same + other).sum(axis=1)[:, None]
+
+    place = (middle[:, None] + _WAY[:, None] * normal[:, None]).astype(np.float32)
+    color = cv2.remap(
+        np.ascontiguousarray(patch.lab[..., 1:]),
+        place[..., 0],
+        place[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).astype(np.float32)
+    size = (len(row), -1)
+    color = along(color.reshape(size), color[:, ::-1].reshape(size), _COLOR_ALONG)
+    color = color.reshape(len(row), len(_WAY), 2)
+    change = np.linalg.norm(color[:, 2:] - color[:, :-2], axis=2) / (_WAY[2] - _WAY[0])
+    change = along(change, change[:, ::-1], _EDGE_ALONG)
+    edge = np.stack([_edge(change, side, width) for side in (-1, 1)], axis=1)
+    is_seen = np.isfinite(edge).astype(float)
+    edge = np.nan_to_num(edge)
+    share = along(is_seen, is_seen[:, ::-1], _EDGE_ALONG)
+    edge = along(edge, -edge[:, ::-1], _EDGE_ALONG) / np.maximum(share, 1e-9)
+    rows, columns = np.nonzero(
+        (label <= OBJECT_LABEL) & (cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    )
+    near = KDTree(middle).query(np.stack([columns, rows], axis=1))[1]
+    away = np.stack([columns, rows], axis=1) - middle[near]
+    across = (away * normal[near]).sum(axis=1)
+    # Beyond its ends, or where its rims do not stand out, it is as it was.
+    is_beside = np.abs(away @ [0, 1] * normal[near, 0] - away @ [1, 0] * normal[near, 1]) < 1.0
+    is_beside &= (share[near] > 0.5).all(axis=1)
+    is_inside = (across >= edge[near, 0]) & (across <= edge[near, 1])
+    result = label.copy()
+    result[rows[is_beside], columns[is_beside]] = np.where(
+        is_inside[is_beside], OBJECT_LABEL, _BACKGROUND
+    )
+    return result
+
+
+def _across(
+    mask: Bool[ndarray, "row column"],
+) -> tuple[
+    Float[ndarray, "row column 2"], Float[ndarray, "row column"], Float[ndarray, "row column"]
+]:
+    """Fit a strip to what of a mask is around each pixel.
+
+    Returns:
+        The direction across it (x, y); how far the pixel is from its middle, that way; and its
+        width [px].
+    """
+    row, column = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
+
+    def mean(value: Float[ndarray, "row column"]) -> Float[ndarray, "row column"]:
+        return cv2.GaussianBlur(np.where(mask, value, 0.0), (0, 0), _STRIP) / total
+
+    total = np.maximum(cv2.GaussianBlur(mask.astype(np.float64), (0, 0), _STRIP), 1e-9)
+    x, y = mean(column), mean(row)
+    xx, yy, xy = mean(column**2) - x**2, mean(row**2) - y**2, mean(column * row) - x * y
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)
+    normal = np.stack([-np.sin(turn), np.cos(turn)], axis=-1)
+    spread = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    off = (column - x) * normal[..., 0] + (row - y) * normal[..., 1]
+    return normal, off, np.sqrt(12 * np.maximum(spread, 1 / 12))
+
+
+def _edge(
+    change: Float[ndarray, "place way"], side: int, width: Float[ndarray, " place"]
+) -> Float[ndarray, " place"]:
+    """Find where across a strip its color changes most on one side [px]; NaN where hardly."""
+    way, half = side * _WAY[1:-1], 0.5 * width[:, None]
+    is_asked = (way >= 0.35 * half) & (way <= 1.25 * half)
+    expected = np.exp(-0.5 * ((way - half + _TOO_WIDE) / _RIM_ERROR) ** 2)
+    best = np.where(is_asked, change * expected, -1.0).argmax(axis=1)
+    most = change[np.arange(len(change)), best]
+    return np.where(most > _LEAST_CHANGE, _WAY[1:-1][best], np.nan)
