@@ -114,11 +114,12 @@ _TOO_THICK = 1.5
 """Thickness of what is hardly a part of it, in its widths."""
 _WIDEST = 16
 """Width from which nothing is called thin [px]."""
-_STRIP = 3.0
-"""Radius (standard deviation) in which the direction of a thin object is looked for [px]."""
+_STRIP, _STRIP_WIDTHS = 3.0, 0.7
+"""Least radius (standard deviation) in which the direction of a thin object is looked for [px], and
+that radius in its widths."""
 _LEAST_MIDDLE = 10
 """Pixels in its middle from which its rims are looked for."""
-_WAY = np.arange(-8.0, 8.01, 0.25)
+_WAY = np.arange(-11.0, 11.01, 0.25)
 """Ways across it at which its color is looked at [px]."""
 _COLOR_ALONG, _EDGE_ALONG = 1.5, 5.0
 """Radii in which colors, and their changes, are averaged along it [px]."""
@@ -1522,8 +1523,9 @@ def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarr
     Its smoothness term would eat what is only a few pixels wide, like a rope.
     """
     mask = (label == OBJECT_LABEL).astype(np.uint8)
-    if _width_of_thin(mask) is not None:
-        return _outlined_along(patch, label)
+    width = _width_of_thin(mask)
+    if width is not None:
+        return _outlined_along(patch, label, max(_STRIP, _STRIP_WIDTHS * width))
     thick = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(3))
     sure = cv2.erode(thick, np.ones((3, 3), np.uint8))
     rim = (cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0) & (sure == 0)
@@ -1543,7 +1545,7 @@ def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarr
 
 
 def _outlined_along(
-    patch: _Patch, label: UInt8[ndarray, "row column"]
+    patch: _Patch, label: UInt8[ndarray, "row column"], radius: float
 ) -> UInt8[ndarray, "row column"]:
     """Put the rims of a long thin object where hue and saturation change most, on average along it.
 
@@ -1552,7 +1554,7 @@ def _outlined_along(
     lit round thing than at its rims.
     """
     mask = label == OBJECT_LABEL
-    normal, off, width = _across(mask)
+    normal, off, width = _across(mask, radius)
     is_middle = mask & (np.abs(off) < 0.5)
     row, column = np.nonzero(is_middle)
     if len(row) < _LEAST_MIDDLE:
@@ -1611,11 +1613,11 @@ def _outlined_along(
 
 
 def _across(
-    mask: Bool[ndarray, "row column"],
+    mask: Bool[ndarray, "row column"], radius: float
 ) -> tuple[
     Float[ndarray, "row column 2"], Float[ndarray, "row column"], Float[ndarray, "row column"]
 ]:
-    """Fit a strip to what of a mask is around each pixel.
+    """Fit a strip to what of a mask is around each pixel, in a Gaussian of that radius [px].
 
     Returns:
         The direction across it (x, y); how far the pixel is from its middle, that way; and its
@@ -1624,9 +1626,9 @@ def _across(
     row, column = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
 
     def mean(value: Float[ndarray, "row column"]) -> Float[ndarray, "row column"]:
-        return cv2.GaussianBlur(np.where(mask, value, 0.0), (0, 0), _STRIP) / total
+        return cv2.GaussianBlur(np.where(mask, value, 0.0), (0, 0), radius) / total
 
-    total = np.maximum(cv2.GaussianBlur(mask.astype(np.float64), (0, 0), _STRIP), 1e-9)
+    total = np.maximum(cv2.GaussianBlur(mask.astype(np.float64), (0, 0), radius), 1e-9)
     x, y = mean(column), mean(row)
     xx, yy, xy = mean(column**2) - x**2, mean(row**2) - y**2, mean(column * row) - x * y
     turn = 0.5 * np.arctan2(2 * xy, xx - yy)

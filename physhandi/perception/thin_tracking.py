@@ -375,8 +375,8 @@ def _bridged(
     path: Float[ndarray, "frame track 3"], has_line: Many[bool], longest: int
 ) -> Float[ndarray, "frame track 3"]:
     """Interpolate places in frames without a line, at most so many in a row."""
-    path, known = path.copy(), np.flatnonzero(has_line)
-    for before, after in pairwise(known.tolist()):
+    path, frames = path.copy(), np.flatnonzero(has_line)
+    for before, after in pairwise(frames.tolist()):
         if 1 < after - before <= longest + 1:
             share = (np.arange(before + 1, after) - before) / (after - before)
             way = path[after] - path[before]

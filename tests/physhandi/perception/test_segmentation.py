@@ -235,16 +235,29 @@ def test_a_ropes_rims_are_where_its_color_changes_most(turn):
     label = (cover > 0.1).astype(np.uint8)  # What shows any of its color.
     assert agreement(label[None], true, 1)[0] < 0.8
     patch = SimpleNamespace(lab=lab)
-    found = segmentation._outlined_along(patch, label)
+    found = segmentation._outlined_along(patch, label, 3.0)
     assert agreement(found[None], true, 1)[0] > 0.89
     label[:, :70] = 2 * (label[:, :70] == 0)  # A hand beside it, which stays.
-    assert (segmentation._outlined_along(patch, label)[label == 2] == 2).all()
+    assert (segmentation._outlined_along(patch, label, 3.0)[label == 2] == 2).all()
+
+
+@pytest.mark.parametrize("width", [3, 7, 12])
+def test_the_direction_across_a_strip_and_its_width_are_found(width):
+    row, column = np.mgrid[:80, :160].astype(float)
+    off = 0.6 * (column - 80) - 0.8 * (row - 40)
+    mask = np.abs(off) < width / 2
+    normal, found, wide = segmentation._across(mask, max(3.0, 0.7 * width))
+    inside = (np.abs(off) < 1.2) & (np.abs(row - 40) < 15)
+    sign = np.sign(normal[..., 0])[inside]
+    np.testing.assert_allclose(sign[:, None] * normal[inside], [[0.6, -0.8]] * len(sign), atol=0.05)
+    np.testing.assert_allclose(sign * found[inside], off[inside], atol=0.25)
+    assert np.median(wide[inside]) == pytest.approx(width, rel=0.15)
 
 
 def test_a_rope_of_the_tables_color_keeps_its_rims():
     lab, cover = filmed_rope(0.3, is_colored=False)
     label = (cover > 0.1).astype(np.uint8)
-    found = segmentation._outlined_along(SimpleNamespace(lab=lab), label)
+    found = segmentation._outlined_along(SimpleNamespace(lab=lab), label, 3.0)
     np.testing.assert_array_equal(found, label)
 
 
