@@ -23,8 +23,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from physhandi.data.camera import triangulate
 from physhandi.data.sequence import Sequence
@@ -107,6 +108,25 @@ _AROUND = 1.5
 
 _BRIDGE = 0.015
 """Pieces that are this near to a hand may hang together behind it [m]."""
+_LEAST_WIDTHS = 14.0
+"""Area of a long thin object in an image, in squares of its width."""
+_TOO_THICK = 1.5
+"""Thickness of what is hardly a part of it, in its widths."""
+_WIDEST = 16
+"""Width from which nothing is called thin [px]."""
+_STRIP, _STRIP_WIDTHS = 3.0, 0.7
+"""Least radius (standard deviation) in which the direction of a thin object is looked for [px], and
+that radius in its widths."""
+_LEAST_MIDDLE = 10
+"""Pixels in its middle from which its rims are looked for."""
+_WAY = np.arange(-11.0, 11.01, 0.25)
+"""Ways across it at which its color is looked at [px]."""
+_COLOR_ALONG, _EDGE_ALONG = 1.5, 5.0
+"""Radii in which colors, and their changes, are averaged along it [px]."""
+_TOO_WIDE, _RIM_ERROR = 0.3, 0.5
+"""How much too far out its rims are before, and by how much that varies [px]."""
+_LEAST_CHANGE = 2.0
+"""Change of color from which it is seen to have a rim there [levels of CIELAB a pixel]."""
 _LEAST_PIECE = 8
 """Pixels of the smallest piece that a hand may cut off."""
 _HAND_DEPTH = 0.09
@@ -1186,11 +1206,11 @@ def _begin(
         label = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
         if has_object:
             label = _hanging_together(seen, patch, label, seed)
+            label, unsure = _without_thick_hands(seen, patch, label)
             is_object = (label == OBJECT_LABEL) | seed
             # From a click, an object of several colors is found by what lies between them.
-            _learn_object(
-                colors, shadowed, _off_rim(seen, patch, is_object) if is_whole else is_object
-            )
+            sure = is_object & ~unsure
+            _learn_object(colors, shadowed, _off_rim(seen, patch, sure) if is_whole else sure)
             farness = _farness(seen, patch, is_object)
         for value, hand in hands.items():
             seen.things[value].replace(patch.code[hand.core & (label == value)])
@@ -1280,9 +1300,11 @@ def _advance(
     farness = _farness(seen, patch, anchor) if has_object else None
     labels, score = _judge(seen, patch, hands, farness, carried, has_object=has_object)
     inner = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
+    unsure = np.zeros(inner.shape, dtype=bool)
     if has_object:
         inner = _hanging_together(seen, patch, inner, anchor)
-    _learn(seen, patch, labels, score, inner)
+        inner, unsure = _without_thick_hands(seen, patch, inner)
+    _learn(seen, patch, labels, score, inner, unsure=unsure)
     result = np.zeros_like(label)
     result[window] = _outlined(patch, inner)
     return result
@@ -1294,8 +1316,10 @@ def _learn(
     labels: list[int],
     score: Float[ndarray, "label row column"],
     label: UInt8[ndarray, "row column"],
+    *,
+    unsure: Bool[ndarray, "row column"],
 ) -> None:
-    """Follow colors as light and sides of things change."""
+    """Follow colors as light and sides of things change, but for what is unsure of the object."""
     if len(labels) < 2:
         return
     ordered = np.sort(score, axis=0)
@@ -1304,7 +1328,9 @@ def _learn(
         rate = _OBJECT_RATE if value == OBJECT_LABEL else _SKIN_RATE
         seen.things[value].fade(_MEMORY * max(50, int((label == value).sum())))
         mine = label == value
-        of_thing = is_sure & (_off_rim(seen, patch, mine) if value == OBJECT_LABEL else mine)
+        if value == OBJECT_LABEL:
+            mine = _off_rim(seen, patch, mine & ~unsure)
+        of_thing = is_sure & mine
         seen.things[value].add(patch.code[of_thing], rate)
         if value == OBJECT_LABEL:
             for share in _SHADOWS[1:]:
@@ -1349,11 +1375,7 @@ def _hanging_together(
     hand = label > OBJECT_LABEL
     owner = np.zeros(count, dtype=np.uint8)
     if is_kept.any() and hand.any():
-        depth = patch.depth[hand & patch.has_depth]
-        reach = _BRIDGE * seen.focal / float(np.median(depth)) if depth.size else 3.0
-        touches, owner = _beside_hands(
-            seen, patch, label, piece, is_kept=is_kept, reach=max(1, round(reach))
-        )
+        touches, owner = _beside_hands(seen, patch, label, piece, is_kept=is_kept)
         if touches[is_kept].any():
             least = max(_LEAST_PIECE, 0.02 * float(stays.sum()))
             is_kept |= touches & (owner == _BACKGROUND) & (size >= least)
@@ -1363,6 +1385,65 @@ def _hanging_together(
     return np.where(is_object & ~stays, owner[piece], label)
 
 
+def _without_thick_hands(
+    seen: _Seen, patch: _Patch, label: UInt8[ndarray, "row column"]
+) -> tuple[UInt8[ndarray, "row column"], Bool[ndarray, "row column"]]:
+    """Give hands what is beside them and too thick for a long thin object, if it may be theirs.
+
+    What keypoints do not reach of a hand goes on in space from the rope that it holds. But a rope
+    is as thin beside a hand as elsewhere, unless it is wound there, which its colors tell.
+
+    Returns:
+        Labels, and what of a long thin object is too near to a hand, or too thick beside one, for
+        its colors to be learned: they may be the hand's, or those of its shadow.
+    """
+    mask = (label == OBJECT_LABEL).astype(np.uint8)
+    hands = np.unique(label[label > OBJECT_LABEL]).tolist()
+    width = _width_of_thin(mask) if hands else None
+    if width is None:
+        return label, np.zeros(label.shape, dtype=bool)
+    thick = _opened(mask, max(2, round(0.5 * (_TOO_THICK * width - 1.0))))
+    thick = mask & cv2.dilate(thick, _disc(round(0.5 * width) + 1))
+    count, piece = cv2.connectedComponents(thick)
+    owner, most = np.zeros_like(label), np.full(label.shape, -np.inf, dtype=np.float32)
+    near, unsure = _disc(_hand_reach(seen, patch, label)), np.zeros(label.shape, dtype=bool)
+    for value in hands:
+        beside = cv2.dilate((label == value).astype(np.uint8), near) > 0
+        density = seen.things[value].log_density(patch.code)
+        is_more = (np.bincount(piece[beside], minlength=count) > 0)[piece] & (density > most)
+        is_more &= thick > 0
+        owner[is_more], most[is_more] = value, density[is_more]
+        unsure |= beside | is_more
+    # What neither shows elsewhere, like shaded skin, is thick as a hand is.
+    own = seen.things[OBJECT_LABEL].log_density(patch.code)
+    return np.where((owner > 0) & (own <= np.maximum(most, 0.0)), owner, label), unsure
+
+
+def _width_of_thin(mask: UInt8[ndarray, "row column"]) -> float | None:
+    """Find the width of a long thin object [px]; None of other things."""
+    width = _typical_width(mask)
+    return None if width is None or mask.sum() < _LEAST_WIDTHS * width**2 else width
+
+
+def _typical_width(mask: UInt8[ndarray, "row column"]) -> float | None:
+    """Find the width that half of a mask is narrower than [px]; None from `_WIDEST` on."""
+    half = 0.5 * float(mask.sum())
+    area = 2.0 * half
+    for radius in range(1, _WIDEST // 2 if half else 1):
+        left = float(_opened(mask, radius).sum())
+        if left < half:
+            return 2.0 * (radius - 1 + (area - half) / (area - left)) + 1.0
+        area = left
+    return None
+
+
+def _opened(mask: UInt8[ndarray, "row column"], radius: int) -> UInt8[ndarray, "row column"]:
+    """Keep what discs of a radius fit into; what goes on beyond the image has room there."""
+    wide = cv2.copyMakeBorder(mask, *(radius,) * 4, cv2.BORDER_REPLICATE)
+    opened = cv2.morphologyEx(wide, cv2.MORPH_OPEN, _disc(radius))
+    return opened[radius:-radius, radius:-radius]
+
+
 def _beside_hands(
     seen: _Seen,
     patch: _Patch,
@@ -1370,7 +1451,6 @@ def _beside_hands(
     piece: Int[ndarray, "row column"],
     *,
     is_kept: Bool[ndarray, " piece"],
-    reach: int,
 ) -> tuple[Bool[ndarray, " piece"], UInt8[ndarray, " piece"]]:
     """Tell which pieces of the object are beside a hand, and which of these are its skin.
 
@@ -1380,19 +1460,19 @@ def _beside_hands(
         label: Labels.
         piece: Numbers of the object's pieces.
         is_kept: Pieces that are the object's.
-        reach: What is beside a hand is at most so far from it [px].
 
     Returns:
         Whether each piece is beside a hand; and the label of the hand whose colors it has rather
         than the object's, 0 of those that are the object's or no hand's.
     """
     is_object = label == OBJECT_LABEL
+    near = _disc(_hand_reach(seen, patch, label))
     is_asked = is_object & ~is_kept[piece]
     count = len(is_kept)
     touches, owner, most = np.zeros(count, bool), np.zeros(count, np.uint8), np.zeros(count)
     own = seen.things[OBJECT_LABEL].log_density(patch.code[is_asked])
     for value in np.unique(label[label > OBJECT_LABEL]).tolist():
-        beside = cv2.dilate((label == value).astype(np.uint8), _disc(reach)) > 0
+        beside = cv2.dilate((label == value).astype(np.uint8), near) > 0
         is_beside = np.bincount(piece[is_object & beside], minlength=count) > 0
         touches |= is_beside
         lead = seen.things[value].log_density(patch.code[is_asked]) - own
@@ -1400,6 +1480,12 @@ def _beside_hands(
         owner[is_beside & (lead > most)] = value
         most = np.where(is_beside, np.maximum(most, lead), most)
     return touches, owner
+
+
+def _hand_reach(seen: _Seen, patch: _Patch, label: UInt8[ndarray, "row column"]) -> int:
+    """Tell how far from a hand something is beside it [px]."""
+    depth = patch.depth[(label > OBJECT_LABEL) & patch.has_depth]
+    return max(1, round(_BRIDGE * seen.focal / float(np.median(depth)))) if depth.size else 3
 
 
 def _pieces(
@@ -1432,11 +1518,14 @@ def _pieces(
 
 
 def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarray, "row column"]:
-    """Let GrabCut decide the object's outermost pixels, where it is thick enough for it.
+    """Decide the object's outermost pixels, by GrabCut where it is thick enough for it.
 
     Its smoothness term would eat what is only a few pixels wide, like a rope.
     """
     mask = (label == OBJECT_LABEL).astype(np.uint8)
+    width = _width_of_thin(mask)
+    if width is not None:
+        return _outlined_along(patch, label, max(_STRIP, _STRIP_WIDTHS * width))
     thick = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(3))
     sure = cv2.erode(thick, np.ones((3, 3), np.uint8))
     rim = (cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0) & (sure == 0)
@@ -1453,3 +1542,109 @@ def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarr
     is_object = (state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)
     result[free] = np.where(is_object[free], OBJECT_LABEL, _BACKGROUND)
     return result
+
+
+def _outlined_along(
+    patch: _Patch, label: UInt8[ndarray, "row column"], radius: float
+) -> UInt8[ndarray, "row column"]:
+    """Put the rims of a long thin object where hue and saturation change most, on average along it.
+
+    Videos keep color at half of their resolution, so the object's reaches a pixel farther than it
+    does, and pixels of which a fifth is the object's count as it. Lightness changes more across a
+    lit round thing than at its rims.
+    """
+    mask = label == OBJECT_LABEL
+    normal, off, width = _across(mask, radius)
+    is_middle = mask & (np.abs(off) < 0.5)
+    row, column = np.nonzero(is_middle)
+    if len(row) < _LEAST_MIDDLE:
+        return label
+    normal, width = normal[is_middle], width[is_middle]
+    middle = np.stack([column, row], axis=1) - off[is_middle, None] * normal
+    pair = KDTree(middle).query_pairs(3 * _EDGE_ALONG, output_type="ndarray")
+    pair = np.concatenate([pair, pair[:, ::-1], np.arange(len(row))[:, None].repeat(2, axis=1)])
+    apart = np.linalg.norm(middle[pair[:, 0]] - middle[pair[:, 1]], axis=1)
+    is_turned = (normal[pair[:, 0]] * normal[pair[:, 1]]).sum(axis=1) < 0
+
+    def along(
+        value: Float[ndarray, "place value"], flipped: Float[ndarray, "place value"], radius: float
+    ) -> Float[ndarray, "place value"]:
+        """Average over places along it; where the direction across it is opposite, flipped ones."""
+        share = np.exp(-0.5 * (apart / radius) ** 2)
+        same, other = (
+            csr_array((share * part, (pair[:, 0], pair[:, 1])), shape=(len(row),) * 2)
+            for part in (~is_turned, is_turned)
+        )
+        return (same @ value + other @ flipped) / (same + other).sum(axis=1)[:, None]
+
+    place = (middle[:, None] + _WAY[:, None] * normal[:, None]).astype(np.float32)
+    color = cv2.remap(
+        np.ascontiguousarray(patch.lab[..., 1:]),
+        place[..., 0],
+        place[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).astype(np.float32)
+    size = (len(row), -1)
+    color = along(color.reshape(size), color[:, ::-1].reshape(size), _COLOR_ALONG)
+    color = color.reshape(len(row), len(_WAY), 2)
+    change = np.linalg.norm(color[:, 2:] - color[:, :-2], axis=2) / (_WAY[2] - _WAY[0])
+    change = along(change, change[:, ::-1], _EDGE_ALONG)
+    edge = np.stack([_edge(change, side, width) for side in (-1, 1)], axis=1)
+    is_seen = np.isfinite(edge).astype(float)
+    edge = np.nan_to_num(edge)
+    share = along(is_seen, is_seen[:, ::-1], _EDGE_ALONG)
+    edge = along(edge, -edge[:, ::-1], _EDGE_ALONG) / np.maximum(share, 1e-9)
+    rows, columns = np.nonzero(
+        (label <= OBJECT_LABEL) & (cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+    )
+    near = KDTree(middle).query(np.stack([columns, rows], axis=1))[1]
+    away = np.stack([columns, rows], axis=1) - middle[near]
+    across = (away * normal[near]).sum(axis=1)
+    # Beyond its ends, or where its rims do not stand out, it is as it was.
+    is_beside = np.abs(away @ [0, 1] * normal[near, 0] - away @ [1, 0] * normal[near, 1]) < 1.0
+    is_beside &= (share[near] > 0.5).all(axis=1)
+    is_inside = (across >= edge[near, 0]) & (across <= edge[near, 1])
+    result = label.copy()
+    result[rows[is_beside], columns[is_beside]] = np.where(
+        is_inside[is_beside], OBJECT_LABEL, _BACKGROUND
+    )
+    return result
+
+
+def _across(
+    mask: Bool[ndarray, "row column"], radius: float
+) -> tuple[
+    Float[ndarray, "row column 2"], Float[ndarray, "row column"], Float[ndarray, "row column"]
+]:
+    """Fit a strip to what of a mask is around each pixel, in a Gaussian of that radius [px].
+
+    Returns:
+        The direction across it (x, y); how far the pixel is from its middle, that way; and its
+        width [px].
+    """
+    row, column = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float64)
+
+    def mean(value: Float[ndarray, "row column"]) -> Float[ndarray, "row column"]:
+        return cv2.GaussianBlur(np.where(mask, value, 0.0), (0, 0), radius) / total
+
+    total = np.maximum(cv2.GaussianBlur(mask.astype(np.float64), (0, 0), radius), 1e-9)
+    x, y = mean(column), mean(row)
+    xx, yy, xy = mean(column**2) - x**2, mean(row**2) - y**2, mean(column * row) - x * y
+    turn = 0.5 * np.arctan2(2 * xy, xx - yy)
+    normal = np.stack([-np.sin(turn), np.cos(turn)], axis=-1)
+    spread = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    off = (column - x) * normal[..., 0] + (row - y) * normal[..., 1]
+    return normal, off, np.sqrt(12 * np.maximum(spread, 1 / 12))
+
+
+def _edge(
+    change: Float[ndarray, "place way"], side: int, width: Float[ndarray, " place"]
+) -> Float[ndarray, " place"]:
+    """Find where across a strip its color changes most on one side [px]; NaN where hardly."""
+    way, half = side * _WAY[1:-1], 0.5 * width[:, None]
+    is_asked = (way >= 0.35 * half) & (way <= 1.25 * half)
+    expected = np.exp(-0.5 * ((way - half + _TOO_WIDE) / _RIM_ERROR) ** 2)
+    best = np.where(is_asked, change * expected, -1.0).argmax(axis=1)
+    most = change[np.arange(len(change)), best]
+    return np.where(most > _LEAST_CHANGE, _WAY[1:-1][best], np.nan)

@@ -16,6 +16,7 @@ All of it is of no use for what stretches, branches, is knotted, crosses itself 
 from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -45,8 +46,11 @@ from physhandi.progress import Progress
 
 _LOOKED_AT = 16
 """Frames of a view by which it is told whether an object is thin."""
-_SPACING, _MOST_POINTS = 0.003, 300
-"""Least distance between tracks along the line [m], and most of them from one end."""
+_SPACING, _POINTS, _MOST_POINTS = 0.003, 250, 300
+"""Distance between tracks along the line [m], unless these are fewer than that along all of it: a
+view shows some three fifths of them in its worst frame; and most of them from one end."""
+_LONGEST_BRIDGE_S = 0.1
+"""Time for which places along a line are interpolated where no line is found [s]."""
 _AROUND_END = 2.5
 """Distance beyond an end in which a view sees what is there, in cells."""
 _BESIDE_END = 0.5
@@ -161,7 +165,7 @@ def thin_tracks(
     trouble = _trouble(lines, measured, count > 0)
     if trouble:
         return {}, trouble
-    paths = _paths(measured)
+    paths = _paths(measured, max(1, round(_LONGEST_BRIDGE_S * frame_rate)))
     count_all = sum(path.shape[1] for path in paths)
     pixel = {view.name: np.full((frame_count, count_all, 2), np.nan, np.float32) for view in views}
     for frame in range(frame_count):
@@ -340,11 +344,14 @@ def _trouble(
     return ""
 
 
-def _paths(measured: list[list[_Measured | None]]) -> list[Float[ndarray, "frame _ 3"]]:
+def _paths(
+    measured: list[list[_Measured | None]], longest_bridge: int
+) -> list[Float[ndarray, "frame _ 3"]]:
     """Lay out the places of points from each end, as far as it is ever measured from there.
 
     Where both ends are on one line, each measures up to the middle, or farther where the other one
-    never does.
+    never does. Up to `longest_bridge` frames in a row without a line get places between those of
+    the frames before and after; whether the object is there is then seen by its masks and depth.
     """
     extents = [[one.extent for one in chain if one is not None] for chain in measured]
     reach = [max(extent) for extent in extents]
@@ -354,12 +361,27 @@ def _paths(measured: list[list[_Measured | None]]) -> list[Float[ndarray, "frame
         cut = [max((x[at].extent for x in both if _is_cut(x, at)), default=0.0) for at in (0, 1)]
         middle = 0.5 * (cut[0] + total - cut[1])
         reach = [max(cut[0], middle), max(cut[1], total - middle)]
+    spacing = min(_SPACING, sum(reach) / _POINTS)
     parts: list[ndarray] = []
     for chain, length in zip(measured, reach, strict=True):
-        arc = np.arange(_SPACING, length, max(_SPACING, length / _MOST_POINTS))
+        arc = np.arange(spacing, length, max(spacing, length / _MOST_POINTS))
         nothing = np.full((len(arc), 3), np.nan)
-        parts.append(np.stack([nothing if one is None else one.places(arc) for one in chain]))
+        path = np.stack([nothing if one is None else one.places(arc) for one in chain])
+        parts.append(_bridged(path, [one is not None for one in chain], longest_bridge))
     return parts
+
+
+def _bridged(
+    path: Float[ndarray, "frame track 3"], has_line: Many[bool], longest: int
+) -> Float[ndarray, "frame track 3"]:
+    """Interpolate places in frames without a line, at most so many in a row."""
+    path, frames = path.copy(), np.flatnonzero(has_line)
+    for before, after in pairwise(frames.tolist()):
+        if 1 < after - before <= longest + 1:
+            share = (np.arange(before + 1, after) - before) / (after - before)
+            way = path[after] - path[before]
+            path[before + 1 : after] = path[before] + share[:, None, None] * way
+    return path
 
 
 def _whole_lengths(measured: list[list[_Measured | None]]) -> list[float]:

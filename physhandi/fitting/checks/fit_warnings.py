@@ -39,6 +39,7 @@ Code = Literal[
     "object_skipped",
     "hand_left_out",
     "hand_filled",
+    "hand_by_one_view",
 ]
 MARGIN, LEAST_EXCESS = 0.1, 5e-4
 """Part of a baseline's error, and length [m], by which a fit must exceed it to be called worse."""
@@ -48,6 +49,8 @@ FEW_FRAMES = 0.2
 """Share of the fitted frames that may show too little."""
 FEW_SEEN = 0.5
 """Share of the frames in which a hand must be seen; in others its pose is filled in."""
+AGREEING = 0.25
+"""Share of a hand's size in an image up to which a view agrees with where it was fitted."""
 _RIVALS: dict[str, tuple[Code, str]] = {
     "static": ("worse_than_static", "an object that stays as it is in frame 0"),
     "rigid_follow": (
@@ -115,14 +118,13 @@ def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> li
     if not (out / files.model).is_file():
         message = skipped_object([sequence])
         skipped = [] if message is None else [FitWarning(code="object_skipped", message=message)]
-        return [*skipped, *_unseen_hands(out, sequence)]
+        return [*skipped, *_unseen_hands(out, sequence), *_lone_views(out, sequence)]
     doubts = [*_at_bounds(out), *_worse_than_baselines(scores), *_doubts_of_shape(out)]
     model = artefacts.load_model(out, sequence.name)
     doubts += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
     if (out / files.observation("point")).is_file():
         doubts += _few_observations(out, sequence)
-    doubts += _unseen_hands(out, sequence)
-    return doubts
+    return [*doubts, *_unseen_hands(out, sequence), *_lone_views(out, sequence)]
 
 
 def _doubts_of_shape(out: Path) -> Iterator[FitWarning]:
@@ -235,6 +237,40 @@ def _unseen_hands(out: Path, sequence: Sequence) -> Iterator[FitWarning]:
                 code="hand_filled",
                 message=f"The {side} hand is seen in few frames: {seen}. In the others its pose "
                 "is filled in by smoothness. Check its keypoints, or cut these frames out.",
+            )
+
+
+def _lone_views(out: Path, sequence: Sequence) -> Iterator[FitWarning]:
+    """Find hands that most frames place by one view, since no other one shows them there."""
+    files = SequenceFiles(sequence.name)
+    views = sequence.views
+    if len(views) < 2 or not (out / files.keypoint).is_file():
+        return
+    keypoint = artefacts.load_array(out / files.keypoint)
+    if keypoint.shape[0] != len(views) or keypoint.shape[2] != len(sequence.hands):
+        return
+    for hand, side in enumerate(sequence.hands):
+        if not (out / files.hand_keypoint(side)).is_file():
+            continue
+        joint = artefacts.load_array(out / files.hand_keypoint(side)).astype(np.float64)
+        is_shown = shows_palm(keypoint[:, :, hand])
+        agrees = np.zeros_like(is_shown)
+        for number, view in enumerate(views):
+            pixel = view.camera.project(joint.reshape(-1, 3)).reshape(*joint.shape[:2], 2)
+            size = np.linalg.norm(np.ptp(pixel, axis=1), axis=1)
+            off = np.linalg.norm(pixel - keypoint[number, :, hand, :, :2], axis=2)
+            off[~is_shown[number]] = np.inf
+            agrees[number] = np.nanmedian(off, axis=1) <= AGREEING * size
+        total = int(is_shown.any(axis=0).sum())
+        lone = int((is_shown.any(axis=0) & (agrees.sum(axis=0) < 2)).sum())
+        if lone > FEW_SEEN * total:
+            yield FitWarning(
+                code="hand_by_one_view",
+                message=f"The {side} hand is placed by one view or none in {lone} of {total} "
+                f"frames: the other ones of {len(views)} find no keypoints of it there, or find "
+                "them elsewhere. It may be centimetres off, and masks and the object with it. Look "
+                "at the keypoints in the viewer; larger images, or keypoints of another detector "
+                "(keypoint.npy), help.",
             )
 
 

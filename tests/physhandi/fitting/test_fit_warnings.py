@@ -98,6 +98,38 @@ def found(stored: Stored, sequence: Sequence) -> dict[str, list[str]]:
     return messages
 
 
+def test_a_hand_that_one_view_alone_places_is_told(
+    tmp_path: Path, stored: Stored, sequence: Sequence
+) -> None:
+    first = sequence.meta.views[0]
+    views = (first, replace(first, name="b"))
+    given = {f"views/{name}/keypoint.npy": np.zeros((FRAMES, 2, 21, 3)) for name in "ab"}
+    both = write_sequence(tmp_path / "both" / "sheet", replace(sequence.meta, views=views), given)
+    joint = np.random.default_rng(0).uniform(-0.1, 0.1, (21, 3)) + np.array([0, 0, 1])
+    pixel = first.camera.project(joint)
+    size = np.linalg.norm(np.ptp(pixel, axis=0))
+    for side in ("right", "left"):
+        stored.array(f"hand_{side}_keypoint", np.broadcast_to(joint, (FRAMES, 21, 3)))
+    keypoint = np.ones((2, FRAMES, 2, 21, 3))
+    keypoint[..., :2] = pixel
+
+    def lone(seen: Sequence) -> list[str]:
+        stored.array("keypoint", keypoint)
+        return found(stored, seen).get("hand_by_one_view", [])
+
+    assert lone(both) == []
+    keypoint[1, :5, 0] = np.nan  # Not found in five of eleven frames, which are too few.
+    keypoint[1, :, 1, :, 0] += 0.24 * size
+    assert lone(both) == []
+    keypoint[1, 10, 0] = np.nan
+    keypoint[1, :, 1, :, 0] += 0.02 * size  # Found elsewhere.
+    right, left = lone(both)
+    assert "The right hand is placed by one view or none in 6 of 11 frames" in right
+    assert "The left hand is placed by one view or none in 11 of 11 frames" in left
+    keypoint = keypoint[:1]
+    assert lone(sequence) == []  # There is no other view.
+
+
 def test_hands_that_were_hardly_seen_are_told(stored: Stored, sequence: Sequence) -> None:
     keypoint = np.ones((1, FRAMES, 2, 21, 3))
     keypoint[:, 5:, 0] = np.nan

@@ -1,4 +1,6 @@
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,6 +16,10 @@ from clicked_disc import (
     write_disc,
 )
 
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.sequence import Sequence, ViewMeta
+from physhandi.data.sequence_meta import SequenceMeta
+from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError, MissingInputError, UsageError
 from physhandi.perception import segmentation
 from physhandi.perception.segmentation import Click, segment
@@ -123,6 +129,136 @@ def test_a_wrist_that_keypoints_do_not_reach_is_the_hands_not_the_objects(tmp_pa
         # Else a quarter of the hand is the object's.
         assert ((label == 1) & (true[view] == 2)).sum() < 0.01 * (true[view] == 2).sum()
         assert agreement(label, true[view], 2).mean() > 0.95
+
+
+def write_fist_on_a_rope(folder: Path, *, knot: bool = False) -> tuple[Sequence, np.ndarray]:
+    """Film a fist on a rope from above; its keypoints are on one half, the other one is shaded.
+
+    With a knot in the rope beside it, the fist is lit all over.
+
+    Returns:
+        The recording, and its true labels.
+    """
+    frames, height, width, focal, eye = 3, 96, 160, 200.0, 0.6
+    random = np.random.default_rng(2)
+    row, column = np.mgrid[:height, :width].astype(float)
+    images: dict[str, np.ndarray] = {}
+    label = np.zeros((frames, height, width), dtype=np.uint8)
+    keypoint = np.ones((frames, 1, 21, 3), dtype=np.float32)
+    for frame in range(frames):
+        color = np.array([190.0, 178, 160]) + random.normal(size=(height, width, 1)) * 4
+        depth = np.full((height, width), eye)
+        on_rope = (np.abs(row - 48 - 6 * np.sin(column / 30)) < 2) & (np.abs(column - 80) < 72)
+        on_rope |= knot & (np.hypot(column - 60, row - 50) < 7)
+        color[on_rope], depth[on_rope], label[frame][on_rope] = (190, 175, 60), eye - 0.01, 1
+        middle = np.array([80.0 + frame, 40.0])
+        fist = np.hypot(column - middle[0], row - middle[1]) < 15
+        share = np.clip((middle[1] + 4 - row) / 8, 0, 1)[fist, None]
+        color[fist] = share * (214, 150, 128) + (1 - share) * np.array(
+            (214, 150, 128) if knot else (130, 95, 75)
+        )
+        depth[fist], label[frame][fist] = eye - 0.018 - 0.02 * share[:, 0], 2
+        color[fist] += random.uniform(-25, 25, (fist.sum(), 1))
+        turn = np.linspace(0, 2 * np.pi, 21)
+        keypoint[frame, 0, :, 0] = middle[0] + 8 * np.cos(turn)
+        keypoint[frame, 0, :, 1] = middle[1] - 8 + 4 * np.sin(turn)
+        depth += 0.001 * random.normal(size=depth.shape)
+        images[f"views/top/color/{frame:05d}.png"] = color.clip(0, 255).round().astype(np.uint8)
+        images[f"views/top/depth/{frame:05d}.png"] = (1000 * depth).round().astype(np.uint16)
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = eye
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    camera = PinholeCamera(K=K, T_world_camera=pose, width=width, height=height)
+    meta = SequenceMeta(
+        name=folder.name,
+        frame_rate=30.0,
+        frame_count=frames,
+        ground_height=0.0,
+        hands=("right",),
+        views=(ViewMeta(name="top", camera=camera),),
+    )
+    arrays = {"views/top/keypoint.npy": keypoint}
+    return write_sequence(folder, meta, arrays, images=images), label
+
+
+def test_a_rope_is_as_thin_beside_a_hand_as_elsewhere(tmp_path, monkeypatch):
+    sequence, true = write_fist_on_a_rope(tmp_path / "rope")
+    click = Click("top", 0, 30, 53)
+    found = segment(sequence, [click])["top"]
+    assert agreement(found, true, 1).min() > 0.8
+    assert agreement(found, true, 2).min() > 0.85
+    monkeypatch.setattr(segmentation, "_TOO_THICK", 20.0)
+    found = segment(sequence, [click])["top"]
+    # Its shaded half is called the rope.
+    assert agreement(found, true, 1).min() < 0.7
+
+
+def test_a_knot_beside_a_hand_stays_the_ropes_by_its_colors(tmp_path):
+    sequence, true = write_fist_on_a_rope(tmp_path / "knot", knot=True)
+    found = segment(sequence, [Click("top", 0, 30, 53)])["top"]
+    assert agreement(found, true, 1).min() > 0.8
+
+
+@pytest.mark.parametrize("width", [2, 3, 5, 8])
+def test_a_lump_hardly_changes_the_typical_width_of_a_rope(width):
+    mask = np.zeros((60, 300), dtype=np.uint8)
+    mask[30 : 30 + width, :280] = 1
+    mask[20:40, 100:112] = 1
+    found = segmentation._typical_width(mask)
+    assert found is not None
+    assert width <= found < width + 2
+    assert segmentation._typical_width(np.ones((60, 60), np.uint8)) is None
+    assert segmentation._typical_width(np.zeros((60, 60), np.uint8)) is None
+
+
+def filmed_rope(turn: float, *, is_colored: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Draw a lit round rope of three pixels in a video's colors: CIELAB, and how much it covers."""
+    row, column = np.mgrid[:100, :160].astype(float)
+    along = (column - 80) * np.cos(turn) + (row - 50) * np.sin(turn)
+    off = (row - 50) * np.cos(turn) - (column - 80) * np.sin(turn) - 4 * np.sin(along / 25)
+    cover = np.clip(1.5 - np.abs(off) + 0.5, 0, 1) * (np.abs(along) < 46)
+    light = np.clip(1 - 0.45 * off / 1.5, 0.4, 1.3)[..., None]
+    paint = np.array([170.0, 155, 50] if is_colored else [190, 178, 160]) * light
+    color = np.array([190.0, 178, 160]) * (1 - cover[..., None]) + paint * cover[..., None]
+    color += np.random.default_rng(0).normal(size=color.shape)
+    luma = cv2.cvtColor(color.clip(0, 255).round().astype(np.uint8), cv2.COLOR_RGB2YCrCb)
+    half = cv2.resize(luma[..., 1:], (80, 50), interpolation=cv2.INTER_AREA)
+    luma[..., 1:] = cv2.resize(half, (160, 100), interpolation=cv2.INTER_LINEAR)
+    film = cv2.cvtColor(luma, cv2.COLOR_YCrCb2RGB)
+    return cv2.cvtColor(film, cv2.COLOR_RGB2LAB), cover
+
+
+@pytest.mark.parametrize("turn", [0.3, 0.7, 2.0, 2.6])
+def test_a_ropes_rims_are_where_its_color_changes_most(turn):
+    lab, cover = filmed_rope(turn)
+    true = np.asarray(cover > 0.5)[None].astype(np.uint8)
+    label = (cover > 0.1).astype(np.uint8)  # What shows any of its color.
+    assert agreement(label[None], true, 1)[0] < 0.8
+    patch = SimpleNamespace(lab=lab)
+    found = segmentation._outlined_along(patch, label, 3.0)
+    assert agreement(found[None], true, 1)[0] > 0.89
+    label[:, :70] = 2 * (label[:, :70] == 0)  # A hand beside it, which stays.
+    assert (segmentation._outlined_along(patch, label, 3.0)[label == 2] == 2).all()
+
+
+@pytest.mark.parametrize("width", [3, 7, 12])
+def test_the_direction_across_a_strip_and_its_width_are_found(width):
+    row, column = np.mgrid[:80, :160].astype(float)
+    off = 0.6 * (column - 80) - 0.8 * (row - 40)
+    mask = np.abs(off) < width / 2
+    normal, found, wide = segmentation._across(mask, max(3.0, 0.7 * width))
+    inside = (np.abs(off) < 1.2) & (np.abs(row - 40) < 15)
+    sign = np.sign(normal[..., 0])[inside]
+    np.testing.assert_allclose(sign[:, None] * normal[inside], [[0.6, -0.8]] * len(sign), atol=0.05)
+    np.testing.assert_allclose(sign * found[inside], off[inside], atol=0.25)
+    assert np.median(wide[inside]) == pytest.approx(width, rel=0.15)
+
+
+def test_a_rope_of_the_tables_color_keeps_its_rims():
+    lab, cover = filmed_rope(0.3, is_colored=False)
+    label = (cover > 0.1).astype(np.uint8)
+    found = segmentation._outlined_along(SimpleNamespace(lab=lab), label, 3.0)
+    np.testing.assert_array_equal(found, label)
 
 
 def test_colors_of_a_blurred_rim_are_not_learned_where_pixels_are_small(tmp_path, monkeypatch):

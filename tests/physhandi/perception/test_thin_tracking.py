@@ -14,6 +14,7 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
+from physhandi.data.view import View
 from physhandi.perception import thin_tracking
 from physhandi.perception.annotation import Correction, correct_masks
 from physhandi.perception.point_tracking import PixelTracks, track_points
@@ -162,13 +163,46 @@ def test_tracks_go_along_with_a_rope_that_is_drawn_along_itself_under_a_hand(rop
     for frame in range(FRAMES):
         column, row = pixel[frame, is_seen[frame]].round().astype(int).T
         assert (labels["top"][frame, row, column] == 1).all()
-    assert is_seen.sum(axis=1).min() >= 60
+    assert is_seen.sum(axis=1).min() >= 150
     away, age = slip(tracks)
     assert (age >= 10).sum() > 300
     assert np.median(np.abs(away[age >= 10])) < 0.7
     assert np.percentile(np.abs(away), 95) < 1.5
     lagging, old = slip(track_points(sequence, labels))
     assert np.median(lagging[old >= 10]) < -3.0
+
+
+def test_places_are_interpolated_where_no_line_is_found_but_the_object_is_seen(
+    rope, followed, monkeypatch
+):
+    sequence, labels = rope
+    view, find = sequence.views[0], thin_tracking.centre_lines
+    whole, _ = followed[0]["top"]
+    lacking, hole = {5, 9, 10, 11, 12}, 60
+    frames = iter(range(FRAMES))
+    monkeypatch.setattr(
+        thin_tracking,
+        "centre_lines",
+        lambda cloud, cell: () if next(frames) in lacking else find(cloud, cell),
+    )
+    monkeypatch.setattr(thin_tracking, "_MEASURED_FRAMES", 0.5)
+    read = type(view).depth
+
+    def depth(self: View, frame: int) -> np.ndarray:
+        image = np.array(read(self, frame))
+        image[:, :hole] *= frame != 5
+        return image
+
+    monkeypatch.setattr(type(view), "depth", depth)
+    pixel, is_seen = follow(sequence, labels)[0]["top"]
+    assert not is_seen[9:13].any()
+    assert is_seen[[8, 13]].any(axis=1).all()
+    assert pixel.shape == whole.shape
+    both = is_seen[5] & np.isfinite(whole[5]).all(axis=-1)
+    assert both.sum() > 100
+    assert np.linalg.norm(pixel[5] - whole[5], axis=-1)[both].max() < 1.0
+    assert np.nanmin(pixel[5, :, 0]) > hole - 2
+    assert np.nanmin(whole[5, :, 0]) < hole - 10
 
 
 def test_points_lie_where_depth_lifts_them(rope, monkeypatch):
