@@ -25,3 +25,8 @@ class ViewerClient(Client):
             return []
         self._keep(self._waiting[0])
         return [self._waiting.popleft()]
+
+    def is_told(self, text: str, *, since: int = 0) -> bool:
+        """Whether a notice with a text came; all other messages as text would be much to write."""
+        messages = self.messages[since:]
+        return any("Notification" in m["type"] and text in str(m) for m in messages)

@@ -300,10 +300,6 @@ def test_a_rectangle_selects_and_each_button_is_one_step(scene, run: Run) -> Non
     assert len(history.steps) == 4
 
 
-def is_told(client: ViewerClient, text: str) -> bool:
-    return any("Notification" in m["type"] and text in str(m) for m in client.messages)
-
-
 def test_a_lasso_and_a_brush_select_when_the_pointer_goes_up(scene, run: Run) -> None:
     session, client = scene
     position = run.array("sequences/lift/rollout.npy")[AT]
@@ -355,7 +351,7 @@ def test_what_cannot_be_edited_changes_nothing(scene, run: Run) -> None:
     session, client = scene
     history = session._object.panel.history
     client.set("Nodes", "Pin")
-    wait(client, lambda: is_told(client, "Nothing is selected."))
+    wait(client, lambda: client.is_told("Nothing is selected."))
     client.set("Selection", "All")
     wait(client, lambda: selected(client) == "81 nodes")
     client.set("Selection", "Invert")
@@ -365,12 +361,12 @@ def test_what_cannot_be_edited_changes_nothing(scene, run: Run) -> None:
     draw(session, client, place - 0.002, place + 0.002)
     wait(client, lambda: selected(client) == "1 node")
     client.set("Springs", "Join")
-    wait(client, lambda: is_told(client, "two nodes or more"))
+    wait(client, lambda: client.is_told("two nodes or more"))
     client.set("Nodes", "Release")
-    wait(client, lambda: is_told(client, "nothing to release"))
+    wait(client, lambda: client.is_told("nothing to release"))
     client.set("Factor", 1.0)
     client.set("Multiply", "Damping")
-    wait(client, lambda: is_told(client, "No spring joins two"))
+    wait(client, lambda: client.is_told("No spring joins two"))
     assert history.steps == (history.begin,)
 
 

@@ -192,10 +192,6 @@ def options(client: ViewerClient) -> tuple[str, ...]:
     return tuple(client.gui[found]["options"]) if found else ()
 
 
-def is_told(client: ViewerClient, text: str) -> bool:
-    return any("Notification" in m["type"] and text in str(m) for m in client.messages)
-
-
 def keep(client: ViewerClient, name: str) -> None:
     client.set("Name of edits", name)
     client.set("Keep edits", True)
@@ -218,7 +214,7 @@ def test_kept_edits_are_one_step_in_another_run_and_deleted(
         client.until(lambda: options(client) == ("as fitted", "by hand"))
         client.set("Name of edits", "Half")
         client.set("Keep edits", True)
-        client.until(lambda: is_told(client, "There are no edits yet"))
+        client.until(lambda: client.is_told("There are no edits yet"))
         soften(session, client)
         client.until(lambda: client.value("Kept edits") == "by hand")
         keep(client, "Half")
@@ -288,7 +284,7 @@ def test_edits_of_another_object_or_recording_change_nothing(sessions: Sessions,
     with client:
         client.until(lambda: "★ Other" in options(client))
         client.set("Kept edits", "★ Other")
-        client.until(lambda: is_told(client, "an object with 3 nodes, and this one has 81."))
+        client.until(lambda: client.is_told("an object with 3 nodes, and this one has 81."))
         client.until(lambda: client.value("Kept edits") == "as fitted")
         assert session._object.panel.history.steps == (session._object.panel.history.begin,)
         client.set("Selection", "All")
@@ -300,7 +296,7 @@ def test_edits_of_another_object_or_recording_change_nothing(sessions: Sessions,
         client.set("Sequence", "drag")
         client.until(lambda: "★ Pinned" in options(client) and client.find("Kept edits") != before)
         client.set("Kept edits", "★ Pinned")
-        client.until(lambda: is_told(client, "belongs to the recording 'lift', and this one is"))
+        client.until(lambda: client.is_told("belongs to the recording 'lift', and this one is"))
         history = session._object.panel.history
         assert history.steps == (history.begin,)
 

@@ -118,12 +118,7 @@ def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
     client.set("Object nodes", True)
     # Nothing was changed: a rollout is not compared with itself.
     press(client, "V")
-    client.until(
-        lambda: any(
-            "Notification" in m["type"] and "V compares with the fit" in str(m)
-            for m in client.messages
-        )
-    )
+    client.until(lambda: client.is_told("V compares with the fit"))
     client.set("stiffness", -1.5)
     client.until(lambda: is_done(client))
     press(client, "V")

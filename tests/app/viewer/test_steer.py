@@ -50,12 +50,6 @@ def wait(client: ViewerClient, condition: Callable[[], object]) -> None:
     client.until(condition, LIMIT_S)
 
 
-def is_told(client: ViewerClient, text: str, *, since: int = 0) -> bool:
-    """Whether a notice with a text came; all other messages as text would be much to write."""
-    messages = client.messages[since:]
-    return any("Notification" in m["type"] and text in str(m) for m in messages)
-
-
 def hold(session: Session, *keys: str) -> None:
     session.keys.hear(json.dumps({"held": keys}))
 
@@ -228,7 +222,7 @@ def test_a_recording_is_kept_as_a_run_and_a_recording(
     scores = run.json("metrics.json")["Up_round"]["future"]
     assert scores["rollout"]["track_error"] == 0.0 < scores["static"]["track_error"]
     client.set("Save as run and recording", True)
-    wait(client, lambda: is_told(client, "There is a recording 'Up_round'"))
+    wait(client, lambda: client.is_told("There is a recording 'Up_round'"))
     assert len(begun) == 1
 
 
@@ -395,7 +389,7 @@ def test_a_fingertip_goes_as_far_as_it_can_and_its_gizmo_comes_back_to_it(index)
     assert client.positions[GIZMO][2] < joint[8, 2] + 0.06
     notices = len(client.messages)
     drag(client, np.full(3, np.nan))
-    wait(client, lambda: is_told(client, "finite", since=notices))
+    wait(client, lambda: client.is_told("finite", since=notices))
     client.set("Move", "right hand")
     wait(client, lambda: np.allclose(client.positions[GIZMO], joint[0], atol=1e-6))
 
@@ -413,7 +407,7 @@ def test_a_hand_lets_go_and_grips_what_is_near_it(scene) -> None:
     wait(client, lambda: object_.newest.position[:, 2].max() < height - 0.03)
     told = len(client.messages)
     press(session, "grip")
-    wait(client, lambda: is_told(client, "Nothing to grip", since=told))
+    wait(client, lambda: client.is_told("Nothing to grip", since=told))
     press(session, "undo")
     wait(client, lambda: object_.motion.holds(0) and client.find("Let go (X)"))
 

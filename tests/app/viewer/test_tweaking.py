@@ -35,11 +35,6 @@ def drawn(client: ViewerClient) -> str:
     )
 
 
-def is_told(client: ViewerClient, text: str) -> bool:
-    """Whether a notification said something."""
-    return any("Notification" in m["type"] and text in str(m) for m in client.messages)
-
-
 def finish(client: ViewerClient) -> None:
     done = f"simulated {FRAMES}/{FRAMES}", "ms a frame", "mm from the fitted rollout"
     client.until(lambda: all(text in client.texts() for text in done))
@@ -218,7 +213,7 @@ def test_a_run_is_saved_with_what_the_sliders_changed(sessions, begun, noted) ->
         client.set("gravity [m/s²]", 1.5)
         client.until(lambda: "gravity [m/s²] 9.81 → 1.5" in client.texts())
         client.set("Save as", "Run")
-        client.until(lambda: is_told(client, "Type a name"))
+        client.until(lambda: client.is_told("Type a name"))
         assert begun == []
         client.set("name", "Moon <b>sheet</b>")
         client.set("Save as", "Run")
@@ -252,7 +247,7 @@ def test_a_simulation_that_diverged_is_not_saved(sessions, begun) -> None:
         client.until(lambda: "then it stopped" in drawn(client))
         client.set("name", "Broken")
         client.set("Save as", "Run")
-        client.until(lambda: is_told(client, "as a run it would"))
+        client.until(lambda: client.is_told("as a run it would"))
         assert begun == []
 
 
