@@ -59,7 +59,7 @@ coverage: install browser $(VENV)/.compiled
 
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install
-	PYTHONPATH=tests $(BIN)/python -m pytest -n 2 --dist loadfile -p random_pauses tests/app
+	PYTHONPATH=tests $(BIN)/python -m pytest -n 2 --dist loadfile -p support.random_pauses tests/app
 
 # Kills, full disks and impatient clients by the hundred; takes hours. Writes docs/reliability.md.
 reliability: install

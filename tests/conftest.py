@@ -12,7 +12,7 @@ from pathlib import Path
 import jaxtyping
 import pytest
 import warp as wp
-from recordings import recording
+from support.inputs.recordings import recording
 
 BROWSERS = ("tests/e2e/", "tests/app/benchmarks/test_viewer_benchmark.py")
 """Files whose tests start browsers."""
@@ -117,7 +117,7 @@ def device(request):
 @pytest.fixture(scope="session")
 def mano_folder(tmp_path_factory):
     """Import a made-up MANO of both sides into a folder."""
-    from mano_file import write_mano
+    from support.inputs.mano_file import write_mano
 
     from physhandi.data.importers.mano import import_mano
 

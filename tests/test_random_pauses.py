@@ -1,7 +1,7 @@
 import shlex
 import sys
 
-from random_pauses import Pauses
+from support.random_pauses import Pauses
 
 from app.viewer.ui.plot import rounded_up
 

@@ -4,9 +4,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from server_world import World, fit_sheet, make_world
-from shared_live import live_process as live_process
-from sheet_sequence import write_sheet
+from support.inputs.sheet_sequence import write_sheet
+from support.server.server_world import World, fit_sheet, make_world
+from support.viewer.shared_live import live_process as live_process
 
 
 @pytest.fixture(scope="session")

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 import yaml
-from server_world import World
 from starlette.testclient import TestClient
+from support.server.server_world import World
 
 from physhandi.data import files
 from physhandi.run import Run

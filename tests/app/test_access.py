@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import surface
-from server_world import HOST, ORIGIN, TOKEN, World, make_world
 from starlette.testclient import TestClient, WebSocketDenialResponse
+from support.server import surface
+from support.server.server_world import HOST, ORIGIN, TOKEN, World, make_world
 
 from app.security import Security
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from clicked_disc import disc_click, write_disc
-from made_models import write_cotracker
-from server_world import ORIGIN, TOKEN, World, make_world
 from starlette.testclient import TestClient
-from waiting import until
+from support.inputs.clicked_disc import disc_click, write_disc
+from support.inputs.made_models import write_cotracker
+from support.server.server_world import ORIGIN, TOKEN, World, make_world
+from support.waiting import until
 
 from app.jobs.catalog import Catalog
 from app.jobs.recordings.annotations import Annotations, ChosenModels, ClickedPlace
@@ -37,7 +37,7 @@ def annotations(
     catalog = Catalog(ServerSettings(data_dir=data_dir), bundled=tmp_path / "none")
     tasks = BackgroundTasks()
     models = ModelFolders(ServerSettings(data_dir=data_dir))
-    yield Annotations(catalog, tasks, models, worker="annotation_worker")
+    yield Annotations(catalog, tasks, models, worker="support.server.annotation_worker")
     tasks.shutdown()
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 from pygltflib import GLTF2
-from server_world import World
-from sheet_sequence import FITTED, FRAMES, NODE
 from starlette.testclient import TestClient
+from support.inputs.sheet_sequence import FITTED, FRAMES, NODE
+from support.server.server_world import World
 
 from physhandi.fitting.config import STAGES
 from physhandi.run import Run

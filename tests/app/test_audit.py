@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from server_world import HOST, ORIGIN, TOKEN, World
+from support.server.server_world import HOST, ORIGIN, TOKEN, World
 
 from app import audit
 from app.audit import KEPT, MOST_REFUSED, AuditLog

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 import uvicorn
-from server_world import TOKEN, World
-from viewer_client import PROTOCOL
-from waiting import LIMIT_S, until
+from support.server.server_world import TOKEN, World
+from support.viewer.viewer_client import PROTOCOL
+from support.waiting import LIMIT_S, until
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 

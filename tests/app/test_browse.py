@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from server_world import World
+from support.server.server_world import World
 
 from app.pages.diff import Section, compare_runs, flatten
 from physhandi.run import Run

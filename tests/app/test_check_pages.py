@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from bad_input_world import FILMED_FRAMES, HEIGHT, fields, truncated, write_filmed
-from server_world import World, make_world
 from starlette.testclient import TestClient
+from support.hostile.bad_input_world import FILMED_FRAMES, HEIGHT, fields, truncated, write_filmed
+from support.server.server_world import World, make_world
 
 from app.previews.overlay import WIDTH, draw_frame
 from physhandi.data.sequence import Sequence

@@ -10,8 +10,8 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 from command_line_page import PAGE, bare, commands, is_positional, page
-from server_world import tiny_config
-from sheet_sequence import FRAMES, NODE, write_sheet
+from support.inputs.sheet_sequence import FRAMES, NODE, write_sheet
+from support.server.server_world import tiny_config
 
 from app import cli
 from app.cli import runs

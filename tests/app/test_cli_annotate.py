@@ -1,8 +1,8 @@
 """The command that finds an object from clicks."""
 
 import pytest
-from clicked_disc import FRAMES, disc_click, write_disc
-from made_models import write_cotracker
+from support.inputs.clicked_disc import FRAMES, disc_click, write_disc
+from support.inputs.made_models import write_cotracker
 
 from app import cli
 from physhandi.data.sequence import Sequence

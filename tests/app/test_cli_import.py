@@ -6,11 +6,11 @@ import sys
 
 import numpy as np
 import pytest
-from clicked_disc import write_disc
-from mano_file import write_mano
-from phystwin_case import write_case
-from phystwin_experiment import write_experiment
-from raw_capture import CAMERAS, RawCapture, ball, picture
+from support.inputs.clicked_disc import write_disc
+from support.inputs.mano_file import write_mano
+from support.inputs.phystwin_case import write_case
+from support.inputs.phystwin_experiment import write_experiment
+from support.inputs.raw_capture import CAMERAS, RawCapture, ball, picture
 
 from app import cli
 from physhandi.data.sequence import Sequence

@@ -1,7 +1,7 @@
 """The command that completes an object by a mesh."""
 
 import pytest
-from half_seen_body import TURN, UNIT, body, write_half_seen, write_mesh
+from support.inputs.half_seen_body import TURN, UNIT, body, write_half_seen, write_mesh
 
 from app import cli
 from physhandi.data.sequence import Sequence

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from server_world import World
+from support.server.server_world import World
 
 from physhandi.data.run_folder import RUN
 from physhandi.run import Run

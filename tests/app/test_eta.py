@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from server_world import World
+from support.server.server_world import World
 
 from app.jobs.eta import (
     Expectation,

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ray_api import TOKEN, MadeCluster, made_cluster
-from waiting import until
+from support.server.ray_api import TOKEN, MadeCluster, made_cluster
+from support.waiting import until
 
 from app import cli
 from app.cli import runs
@@ -24,7 +24,7 @@ from physhandi.errors import PhysHandiError, RunError
 from physhandi.progress import Progress
 from physhandi.run import Run
 
-WORKER = "job_worker"
+WORKER = "support.server.job_worker"
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import socket
 from threading import Thread
 
 import uvicorn
+from support.waiting import LIMIT_S, until
 from uvicorn.protocols.http.h11_impl import H11Protocol
-from waiting import LIMIT_S, until
 
 from app.graceful_server import GracefulServer
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from server_world import TOKEN, World
 from starlette.testclient import TestClient
+from support.server.server_world import TOKEN, World
 
 from app import health
 from app.logs import write_logs

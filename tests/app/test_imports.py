@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from raw_capture import FRAMES, RawCapture
-from server_world import World, make_world
-from waiting import until
+from support.inputs.raw_capture import FRAMES, RawCapture
+from support.server.server_world import World, make_world
+from support.waiting import until
 
 from app.jobs.catalog import Catalog
 from app.jobs.recordings.background import BackgroundTasks
@@ -80,7 +80,7 @@ def test_the_operator_names_folders_that_are_there(data_dir: Path) -> None:
 def imports(settings: ServerSettings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Imports]:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
     tasks = BackgroundTasks()
-    yield Imports(settings, Catalog(settings), tasks, worker="import_worker")
+    yield Imports(settings, Catalog(settings), tasks, worker="support.server.import_worker")
     tasks.shutdown()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from waiting import LIMIT_S, WatchedLock, until
+from support.waiting import LIMIT_S, WatchedLock, until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
@@ -40,7 +40,9 @@ class Desk:
         self.settings = ServerSettings(data_dir=data_dir, cancel_grace_s=GRACE_S, **settings)
         self.catalog = Catalog(self.settings)
         choice = cards and DeviceChoice(self.settings, cards, card_of=lambda name: f"GPU {name}")
-        self.scheduler = Scheduler(self.settings, self.catalog, choice=choice, worker="job_worker")
+        self.scheduler = Scheduler(
+            self.settings, self.catalog, choice=choice, worker="support.server.job_worker"
+        )
 
     def launch(self, behaviour: str) -> str:
         return self.scheduler.launch(["sheet"], "quick", behaviour).id

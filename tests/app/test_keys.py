@@ -4,7 +4,7 @@ import html
 import re
 from pathlib import Path
 
-from server_world import World
+from support.server.server_world import World
 
 from app.keys import KEYS, key_of
 from app.viewer.color.quantities import QUANTITIES

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from server_world import World, make_world
 from starlette.testclient import TestClient
+from support.server.server_world import World, make_world
 
 from app.jobs.launch_keys import KeyedRequest, LaunchKeys
 

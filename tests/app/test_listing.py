@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from server_world import World
+from support.server.server_world import World
 
 from app.jobs import catalog
 from app.jobs.catalog import Catalog, UnknownRunError

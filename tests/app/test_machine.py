@@ -11,7 +11,7 @@ from typing import Any
 
 import psutil
 import pytest
-from waiting import LIMIT_S, until
+from support.waiting import LIMIT_S, until
 
 from app.jobs import machine as cards_module
 from app.jobs.machine import Cards, Machine, ask_driver

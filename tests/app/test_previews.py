@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image, ImageSequence
-from server_world import World
-from waiting import LIMIT_S, until
+from support.server.server_world import World
+from support.waiting import LIMIT_S, until
 
 from app.previews import store, worker
 from app.previews.camera import fitting_camera

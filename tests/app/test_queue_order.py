@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from server_world import World, make_world
+from support.server.server_world import World, make_world
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from ray_cluster import NEEDED, RAY, RealCluster, real_cluster
-from suite_world import order_of, table, write_told
-from waiting import until
+from support.server.ray_cluster import NEEDED, RAY, RealCluster, real_cluster
+from support.server.suite_world import order_of, table, write_told
+from support.waiting import until
 
 from app.cli.lookup import read_settings
 from app.cli.suite_jobs import SUITE_WORKER, SuiteJobs
@@ -21,6 +21,8 @@ from app.settings import ServerSettings
 from physhandi.progress import Progress
 from physhandi.run import Run
 from physhandi.synthetic.suite.evaluation import evaluate_suite
+
+WORKER = "support.server.job_worker"
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not RAY.exists(), reason=NEEDED)]
 
@@ -53,7 +55,7 @@ class Desk:
             }
         )
         self.catalog = Catalog(self.settings)
-        self.scheduler = Scheduler(self.settings, self.catalog, worker="job_worker")
+        self.scheduler = Scheduler(self.settings, self.catalog, worker=WORKER)
 
     def launch(self, behaviour: str) -> Run:
         return self.scheduler.launch(["sheet"], "quick", behaviour)
@@ -80,7 +82,7 @@ def test_fits_take_turns_on_a_node_and_a_new_server_finds_them(
 ) -> None:
     first, second = desk.launch("wait 1"), desk.launch("publish 2")
     desk.until(first, "running")
-    (worker,) = [p for p in processes_of(first.folder) if p.cmdline()[2] == "job_worker"]
+    (worker,) = [p for p in processes_of(first.folder) if p.cmdline()[2] == WORKER]
     environment = worker.environ()
     assert "RAY_AUTH_TOKEN" not in environment
     assert environment["OMP_NUM_THREADS"] == "1"
@@ -140,7 +142,7 @@ def test_a_command_follows_a_fit_and_ctrl_c_returns_when_nothing_is_left(
             sequences=[sheet],
             config={},
         )
-        engine = reached_cluster(read_settings(engine=told), "job_worker")
+        engine = reached_cluster(read_settings(engine=told), WORKER)
 
         class Interrupting(Progress):
             def check_cancelled(self, folder: Path = run.folder) -> None:

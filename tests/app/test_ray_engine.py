@@ -9,8 +9,8 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
-from ray_api import TOKEN, MadeCluster, made_cluster
-from waiting import LIMIT_S, until
+from support.server.ray_api import TOKEN, MadeCluster, made_cluster
+from support.waiting import LIMIT_S, until
 
 from app.cli.lookup import read_settings
 from app.jobs.catalog import Catalog
@@ -28,6 +28,7 @@ from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
 from physhandi.run_store import RunStore
 
+WORKER = "support.server.job_worker"
 FULL = "Waits for a free place on the cluster."
 
 
@@ -39,7 +40,7 @@ class ClusterDesk:
             data_dir=data_dir, engine_token=TOKEN, cancel_grace_s=0.01, **settings
         )
         self.catalog = Catalog(self.settings)
-        self.scheduler = Scheduler(self.settings, self.catalog, worker="job_worker")
+        self.scheduler = Scheduler(self.settings, self.catalog, worker=WORKER)
 
     def launch(self, name: str = "fit") -> str:
         return self.scheduler.launch(["sheet"], "quick", name).id
@@ -102,7 +103,7 @@ def test_a_fit_is_one_job_with_the_same_supervisor(
         *("exec", "env"),
         f"PHYSHANDI_RUN={folder}:{nonce}",
         *("OMP_NUM_THREADS=3", "OPENBLAS_NUM_THREADS=3", "MKL_NUM_THREADS=3"),
-        *("/a b/py", "-m", "app.jobs.supervise", str(folder), "cuda:0", "job_worker", "120.0"),
+        *("/a b/py", "-m", "app.jobs.supervise", str(folder), "cuda:0", WORKER, "120.0"),
     ]
     wanted = ("entrypoint_num_cpus", "entrypoint_num_gpus", "entrypoint_memory")
     assert [job[name] for name in wanted] == [3, 1, 3 * 2**29]

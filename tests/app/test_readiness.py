@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bad_input_world import Terminal, write_filmed
-from server_world import World, make_world
+from support.hostile.bad_input_world import Terminal, write_filmed
+from support.server.server_world import World, make_world
 
 from app.cli import runs
 from physhandi.errors import RunError

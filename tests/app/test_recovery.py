@@ -13,11 +13,11 @@ from unittest.mock import patch
 
 import pytest
 import yaml
-from bad_input_world import Terminal, tree
-from queue_world import queue_world
-from run_world import make_run
-from server_world import World, make_world
-from waiting import until
+from support.hostile.bad_input_world import Terminal, tree
+from support.server.queue_world import queue_world
+from support.server.run_world import make_run
+from support.server.server_world import World, make_world
+from support.waiting import until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog

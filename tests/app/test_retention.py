@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bad_input_world import Terminal
-from server_world import World, make_world
+from support.hostile.bad_input_world import Terminal
+from support.server.server_world import World, make_world
 
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.uploads import Uploads

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from server_world import World, make_world
+from support.server.server_world import World, make_world
 
 from app.jobs.storage.room import NoRoomError, Room, files_in
 from app.settings import ServerSettings

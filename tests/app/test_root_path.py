@@ -9,11 +9,11 @@ from typing import Any
 from urllib.parse import urljoin, urlsplit
 
 import pytest
-import queue_world
 from pydantic import SecretStr, ValidationError
-from server_world import HOST, ORIGIN, TOKEN
 from starlette.testclient import TestClient, WebSocketDenialResponse
-from surface import routes
+from support.server import queue_world
+from support.server.server_world import HOST, ORIGIN, TOKEN
+from support.server.surface import routes
 
 from app.exports.cache import FileCache, FileJob
 from app.exports.request import FileRequest

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from queue_world import HOSTILE, QueueWorld, queue_world
-from server_world import World
-from waiting import until
+from support.server.queue_world import HOSTILE, QueueWorld, queue_world
+from support.server.server_world import World
+from support.waiting import until
 
 from app import api
 from app.jobs.catalog import RunItem

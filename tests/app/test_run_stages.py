@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from run_world import make_run
+from support.server.run_world import make_run
 
 from app.jobs.views import explain, stage_views, stages_of
 from physhandi.data.files import write_json

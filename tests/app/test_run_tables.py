@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from run_world import make_run
+from support.server.run_world import make_run
 
 from app.pages.metrics import about_quantity, tabulate
 from app.pages.parameters import meaning_of, parameter_rows

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from server_world import HOST, ORIGIN, TOKEN, World, make_world
 from starlette.routing import Mount
 from starlette.testclient import WebSocketDenialResponse
+from support.server.server_world import HOST, ORIGIN, TOKEN, World, make_world
 
 from app.security import PAGE_POLICY, VIEWER_POLICY
 from app.settings import WEB_ASSETS

@@ -16,8 +16,8 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
+from support.waiting import LIMIT_S, until
 from uvicorn.server import ServerState
-from waiting import LIMIT_S, until
 from websockets.sync.client import connect
 
 from app.graceful_server import GracefulServer

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from queue_world import QueueWorld, queue_world, serving
-from waiting import LIMIT_S
+from support.server.queue_world import QueueWorld, queue_world, serving
+from support.waiting import LIMIT_S
 
 
 class Stream:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ray_api import TOKEN, MadeCluster, made_cluster
-from suite_world import order_of, table, write_told
-from waiting import until
+from support.server.ray_api import TOKEN, MadeCluster, made_cluster
+from support.server.suite_world import order_of, table, write_told
+from support.waiting import until
 
 from app.cli.lookup import read_settings
 from app.cli.suite_jobs import SUITE_WORKER, SuiteJobs

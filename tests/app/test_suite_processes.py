@@ -12,8 +12,8 @@ from typing import Any
 
 import psutil
 import pytest
-from suite_world import order_of, table, write_told
-from waiting import LIMIT_S
+from support.server.suite_world import order_of, table, write_told
+from support.waiting import LIMIT_S
 
 from app.cli import suite_processes
 from app.cli.suite_processes import SuiteProcesses

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from server_world import World
+from support.server.server_world import World
 
 from physhandi.data.sequence import Sequence
 from physhandi.metrics.suite_report import SEED_COLUMNS, read_rows, to_csv

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from run_world import make_run
+from support.server.run_world import make_run
 
 from app.jobs.supervise import count_memory_kills
 from app.jobs.ticket import (

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from server_world import World
 from starlette.testclient import TestClient
-from waiting import until
+from support.server.server_world import World
+from support.waiting import until
 
 from app.jobs.recordings import unpacking, upload_names, uploads
 from app.jobs.recordings.background import BackgroundTasks

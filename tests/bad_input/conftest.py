@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bad_input_world import Terminal, write_filmed
-from server_world import fit_sheet, tiny_config
-from shared_live import live_process as live_process
-from sheet_sequence import write_sheet
+from support.hostile.bad_input_world import Terminal, write_filmed
+from support.inputs.sheet_sequence import write_sheet
+from support.server.server_world import fit_sheet, tiny_config
+from support.viewer.shared_live import live_process as live_process
 
 from app.cli import runs
 

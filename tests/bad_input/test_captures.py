@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
-from header_bombs import exr
-from hostile_pickles import Hostile
-from raw_capture import (
+from support.hostile.header_bombs import exr
+from support.hostile.hostile_pickles import Hostile
+from support.inputs.raw_capture import (
     BOARD,
     CAMERAS,
     FOCAL,

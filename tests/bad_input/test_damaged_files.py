@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from damaged_files import damage_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from property_tests import SAME_EVERYWHERE
+from support.hostile.damaged_files import damage_file
+from support.property_tests import SAME_EVERYWHERE
 
 from app.exports.shares import Shares, StoredShare
 from app.jobs.catalog import RunIndex

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from bad_input_world import Terminal
-from damaged_files import places
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from property_tests import SAME_EVERYWHERE
-from server_world import make_world
 from starlette.testclient import TestClient
+from support.hostile.bad_input_world import Terminal
+from support.hostile.damaged_files import places
+from support.property_tests import SAME_EVERYWHERE
+from support.server.server_world import make_world
 
 from app.cli.runs import OVERRIDES
 from physhandi import pipeline

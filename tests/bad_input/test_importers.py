@@ -8,11 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bad_input_world import Bad, Terminal, array, bad, both, film, put, removed, table, truncated
-from mano_file import write_mano
-from phystwin_case import write_case
-from phystwin_damage import final, image_file, metadata, moved, split, tracks
-from phystwin_experiment import save_checkpoint, write_experiment
+from support.hostile.bad_input_world import (
+    Bad,
+    Terminal,
+    array,
+    bad,
+    both,
+    film,
+    put,
+    removed,
+    table,
+    truncated,
+)
+from support.inputs.mano_file import write_mano
+from support.inputs.phystwin_case import write_case
+from support.inputs.phystwin_damage import final, image_file, metadata, moved, split, tracks
+from support.inputs.phystwin_experiment import save_checkpoint, write_experiment
 
 CANARY = "canary"
 """File that a hostile pickle makes if anything of it is executed."""
@@ -206,7 +217,7 @@ MANO = {
 
 
 def _template() -> np.ndarray:
-    from mano_file import mano_arrays
+    from support.inputs.mano_file import mano_arrays
 
     return mano_arrays("right")["v_template"]
 

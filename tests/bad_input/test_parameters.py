@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from bad_input_world import Terminal, table, tree
+from support.hostile.bad_input_world import Terminal, table, tree
 
 SIMULATE = {
     # option, value, what the message names

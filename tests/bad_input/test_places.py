@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bad_input_world import Terminal, table, tree
-from waiting import LIMIT_S
+from support.hostile.bad_input_world import Terminal, table, tree
+from support.waiting import LIMIT_S
 
 from physhandi import pipeline
 from physhandi.run import Run

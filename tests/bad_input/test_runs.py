@@ -8,8 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bad_input_world import Bad, Terminal, array, bad, put, removed, table, text, truncated
-from sheet_sequence import write_sheet
+from support.hostile.bad_input_world import (
+    Bad,
+    Terminal,
+    array,
+    bad,
+    put,
+    removed,
+    table,
+    text,
+    truncated,
+)
+from support.inputs.sheet_sequence import write_sheet
 
 from physhandi.data.run_folder import artefacts, file_record
 from physhandi.run import Run

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bad_input_world import (
+from support.hostile.bad_input_world import (
     FILMED_FRAMES,
     Bad,
     Terminal,
@@ -22,7 +22,7 @@ from bad_input_world import (
     text,
     truncated,
 )
-from server_world import tiny_config
+from support.server.server_world import tiny_config
 
 from app.cli import runs
 

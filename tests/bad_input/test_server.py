@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bad_input_world import bad, both, fields, put, removed, table, text, truncated
-from server_world import World, make_world
 from starlette.testclient import TestClient
+from support.hostile.bad_input_world import bad, both, fields, put, removed, table, text, truncated
+from support.server.server_world import World, make_world
 
 from app.jobs.worker import fill_run
 from physhandi.errors import PhysHandiError

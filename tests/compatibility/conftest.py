@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from old_data import OldFolder, read_record, serve, settle, unpack
-from server_world import World
+from support.inputs.old_data import OldFolder, read_record, serve, settle, unpack
+from support.server.server_world import World
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-import surface
+from support.server import surface
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from pydantic import SecretStr

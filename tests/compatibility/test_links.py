@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from old_data import SAME_MOTION_M, OldFolder, command, differences
-from server_world import World
+from support.inputs.old_data import SAME_MOTION_M, OldFolder, command, differences
+from support.server.server_world import World
 
 from app.exports.permalink import state_from_query, state_to_query
 from app.viewer.compare.request import CompareAsk

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from old_data import SAME_MOTION_M, OldFolder, command, differences, serve, unpack
-from server_world import World
 from starlette.testclient import TestClient
+from support.inputs.old_data import SAME_MOTION_M, OldFolder, command, differences, serve, unpack
+from support.server.server_world import World
 
 from app.viewer.content.content import open_run_content, open_sequence_content
 from app.viewer.physics.presets import PresetStore

@@ -13,15 +13,15 @@ from urllib.parse import urlencode
 
 import numpy as np
 import pytest
-import surface
 import yaml
 from fastapi import FastAPI
-from old_data import FIXTURE, OldFolder, command, read_record, settle, unpack
 from pydantic import SecretStr, ValidationError
 from safetensors import safe_open
-from server_world import ORIGIN, TOKEN
 from starlette.testclient import TestClient
-from viewer_client import ViewerClient
+from support.inputs.old_data import FIXTURE, OldFolder, command, read_record, settle, unpack
+from support.server import surface
+from support.server.server_world import ORIGIN, TOKEN
+from support.viewer.viewer_client import ViewerClient
 
 from app import cli
 from app.exports.permalink import state_from_query

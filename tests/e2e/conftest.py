@@ -21,15 +21,15 @@ from playwright.sync_api import (
     expect,
     sync_playwright,
 )
-from scene_page import (
+from support.browser.scene_page import (
     COARSER_PICTURES,
     FEWER_PICTURES,
     LESS_WORK,
     TIMEOUT_MS,
     ScenePage,
 )
-from small_pictures import place_pictures
-from waiting import LIMIT_S, until
+from support.browser.small_pictures import place_pictures
+from support.waiting import LIMIT_S, until
 
 from app.benchmarks.browser import find_chromium
 from app.jobs.processes import end_processes

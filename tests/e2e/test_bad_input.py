@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from bad_input_world import fields, truncated
 from playwright.sync_api import Browser, Page, expect
-from scene_page import TIMEOUT_MS
-from sheet_sequence import write_sheet
+from support.browser.scene_page import TIMEOUT_MS
+from support.hostile.bad_input_world import fields, truncated
+from support.inputs.sheet_sequence import write_sheet
 
 pytestmark = pytest.mark.e2e
 BUNDLED_RUN = Path(__file__).parents[2] / "sequences/runs/towel_fold_quick"

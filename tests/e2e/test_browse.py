@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from accessibility import COLOR_RULES, violations
-from clicked_disc import HEIGHT, TOP, WIDTH, cameras, center, write_disc
 from playwright.sync_api import Page, Route, expect
-from raw_capture import RawCapture
-from scene_page import TIMEOUT_MS
-from sheet_sequence import write_sheet
+from support.browser.accessibility import COLOR_RULES, violations
+from support.browser.scene_page import TIMEOUT_MS
+from support.inputs.clicked_disc import HEIGHT, TOP, WIDTH, cameras, center, write_disc
+from support.inputs.raw_capture import RawCapture
+from support.inputs.sheet_sequence import write_sheet
 
 from physhandi.data.sequence import Sequence
 

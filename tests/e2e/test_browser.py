@@ -13,7 +13,7 @@ import pytest
 import yaml
 from playwright.sync_api import expect
 from safetensors.numpy import load_file
-from scene_page import ScenePage, object_springs
+from support.browser.scene_page import ScenePage, object_springs
 
 from app.jobs.processes import COOKIE
 from physhandi.run import Run

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
-from scene_page import ScenePage
+from support.browser.scene_page import ScenePage
 
 from app.settings import BUNDLED
 from physhandi.run import Run

@@ -11,9 +11,9 @@ from urllib.parse import parse_qs, urljoin, urlsplit
 import cv2
 import numpy as np
 import pytest
-from gltf_player import Player
 from playwright.sync_api import Browser, BrowserContext, Page, expect
-from scene_page import FEWER_PICTURES, TIMEOUT_MS, ScenePage
+from support.browser.scene_page import FEWER_PICTURES, TIMEOUT_MS, ScenePage
+from support.viewer.gltf_player import Player
 
 pytestmark = pytest.mark.e2e
 BUNDLED = Path(__file__).parents[2] / "sequences/runs/towel_fold_quick"

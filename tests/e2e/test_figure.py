@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from scene_page import ScenePage
+from support.browser.scene_page import ScenePage
 
 pytestmark = pytest.mark.e2e
 FRAME = 30

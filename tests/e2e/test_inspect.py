@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from scene_page import ScenePage
-from viewer_world import FolderCatalog
+from support.browser.scene_page import ScenePage
+from support.viewer.viewer_world import FolderCatalog
 
 from app.benchmarks.splats import scattered
 from app.viewer.content.content import open_run_content

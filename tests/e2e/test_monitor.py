@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from playwright.sync_api import BrowserContext, Page, expect
-from queue_world import QueueWorld, queue_world, serving
-from sheet_sequence import write_sheet
+from support.inputs.sheet_sequence import write_sheet
+from support.server.queue_world import QueueWorld, queue_world, serving
 
 from physhandi.data.attempt import PreviewFile
 from physhandi.progress import Preview

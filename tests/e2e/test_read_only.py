@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import Browser, Page, Request, expect
-from scene_page import FEWER_PICTURES, TIMEOUT_MS
+from support.browser.scene_page import FEWER_PICTURES, TIMEOUT_MS
 
 from app.security import only_looks
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from urllib.parse import urljoin, urlsplit
 
 import pytest
-from waiting import LIMIT_S
+from support.waiting import LIMIT_S
 
 pytestmark = pytest.mark.e2e
 START = "from app.cli import main; main()"

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import yaml
-from accessibility import COLOR_RULES, violations
 from playwright.sync_api import expect
+from support.browser.accessibility import COLOR_RULES, violations
 
 from physhandi.run import Run
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filmed_sheet import write_filmed_sheet
-from lpips_weights import write_lpips
-from sheet_sequence import FRAMES, NODE, sheet_config
-from stopped_fits import Stopper, write_always
+from support.inputs.filmed_sheet import write_filmed_sheet
+from support.inputs.lpips_weights import write_lpips
+from support.inputs.sheet_sequence import FRAMES, NODE, sheet_config
+from support.physics.stopped_fits import Stopper, write_always
 
 from physhandi import pipeline
 from physhandi.appearance.splats import Splats

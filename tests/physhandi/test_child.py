@@ -9,7 +9,7 @@ from typing import Any
 
 import psutil
 import pytest
-from waiting import until
+from support.waiting import until
 
 from physhandi import child as child_module
 from physhandi.child import (
@@ -39,7 +39,7 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def start(deed: str, **options: object) -> Child:
-    return Child("child_deeds", deed, **options)  # type: ignore[arg-type]  # passed on as they are
+    return Child("support.child_deeds", deed, **options)  # type: ignore[arg-type]  # passed on as they are
 
 
 def test_requests_and_messages_are_lines_of_json_in_every_locale(
@@ -83,7 +83,7 @@ def test_a_child_gets_our_packages_and_few_threads_and_no_secret(
         ("defect", RunError, "^KeyError: 'node'$"),
         ("disk", RunError, "/there: No space left on device. Free some space"),
         ("cancelled", CancelledError, "^stopped$"),
-        ("silent", ChildEndedError, "^The process of child_deeds ended with code 5.$"),
+        ("silent", ChildEndedError, "^The process of support.child_deeds ended with code 5.$"),
         ("crash", ChildEndedError, "ended with code 7. the last words$"),
     ],
 )
@@ -113,7 +113,7 @@ def test_a_child_ends_with_its_parent_unless_it_outlives_it() -> None:
         "import os\n"
         "for outlives in (False, True):\n"
         "    options = {'outlives_parent': outlives, 'start_new_session': True}\n"
-        "    print(start_module('child_deeds', 'forever', **options).pid, flush=True)\n"
+        "    print(start_module('support.child_deeds', 'forever', **options).pid, flush=True)\n"
         "input()\n"
     )
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
@@ -232,7 +232,7 @@ def test_a_folder_of_the_user_s_named_like_a_package_is_not_run(tmp_path: Path) 
         (tmp_path / package / "__init__.py").write_text("raise SystemExit('not ours')")
     code = (
         "from physhandi.child import Child\n"
-        "with Child('child_deeds', 'about') as child:\n"
+        "with Child('support.child_deeds', 'about') as child:\n"
         "    print(next(child.messages())['folder'])\n"
     )
     places = [str(PACKAGE_ROOT), os.environ["PYTHONPATH"]]

@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hanging_node import hanging_node
 from safetensors.numpy import save_file
-from viewer_world import PARAMETERS, make_run
+from support.physics.hanging_node import hanging_node
+from support.viewer.viewer_world import PARAMETERS, make_run
 
 from app.settings import BUNDLED
 from physhandi.data.layout import SequenceFiles

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
-from sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
-from stopped_fits import Stopper, write_always
+from support.inputs.sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
+from support.physics.stopped_fits import Stopper, write_always
 
 from app.jobs.views import loss_curves
 from physhandi import pipeline

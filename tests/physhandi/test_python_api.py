@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gltf_player import Player
 from reference.gradients import directional_difference, loss_weights
 from reference.scenes import as_model, cube_scene
-from sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
+from support.inputs.sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
+from support.viewer.gltf_player import Player
 
 import physhandi as ph
 from physhandi.data.layout import SequenceFiles

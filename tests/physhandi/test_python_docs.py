@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from sheet_sequence import FRAMES, NODE, sheet_config, write_sheet
+from support.inputs.sheet_sequence import FRAMES, NODE, sheet_config, write_sheet
 
 import physhandi as ph
 from physhandi import pipeline

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import recording
+from support.inputs.recordings import recording
 
 from physhandi import pipeline
 from physhandi.data.importers.mocap import import_mocap

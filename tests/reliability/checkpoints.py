@@ -7,11 +7,11 @@ from contextlib import suppress
 from pathlib import Path
 from unittest.mock import patch
 
-import hand_scene as scene
 import numpy as np
-from sheet_sequence import sheet_config, write_sheet
-from stopped_fits import Stopper
-from waiting import until
+from support.inputs.sheet_sequence import sheet_config, write_sheet
+from support.physics import hand_scene as scene
+from support.physics.stopped_fits import Stopper
+from support.waiting import until
 
 from app.jobs.worker import fill_run
 from physhandi import pipeline

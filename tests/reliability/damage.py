@@ -13,11 +13,11 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from damaged_files import damage_file
-from old_data import differences, read_record, serve, settle, unpack
-from server_world import World, fit_sheet, make_world
-from sheet_sequence import write_sheet
-from waiting import until
+from support.hostile.damaged_files import damage_file
+from support.inputs.old_data import differences, read_record, serve, settle, unpack
+from support.inputs.sheet_sequence import write_sheet
+from support.server.server_world import World, fit_sheet, make_world
+from support.waiting import until
 
 from app.jobs.catalog import DEFECT
 from app.jobs.engines.local_engine import LocalEngine
@@ -209,7 +209,7 @@ def _start(deed: str, folder: Path) -> "subprocess.Popen[str]":
     """Start a process and wait until it is in the middle of its deed."""
     tests = Path(__file__).parents[1]
     child = subprocess.Popen(
-        [sys.executable, str(tests / "half_done.py"), deed, str(folder)],
+        [sys.executable, str(tests / "support/hostile/half_done.py"), deed, str(folder)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

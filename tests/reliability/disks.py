@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import job_worker
 import numpy as np
-from waiting import until
+from support.server import job_worker
+from support.waiting import until
 
 from app.jobs.processes import processes_of
 from app.jobs.scheduler import ENDED

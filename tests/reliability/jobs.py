@@ -15,9 +15,9 @@ from unittest.mock import patch
 
 import numpy as np
 from psutil import _pslinux
-from sheet_sequence import write_sheet
-from suite_world import SETTINGS
-from waiting import until
+from support.inputs.sheet_sequence import write_sheet
+from support.server.suite_world import SETTINGS
+from support.waiting import until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog, RunItem
@@ -91,7 +91,7 @@ def queue_in(folder: Path, **settings: Any) -> Iterator[Scheduler]:
     """Work through a queue of made-up fits; when it is over, nothing of it is at work."""
     write_sheet(folder / "sequences" / "sheet")
     asked = ServerSettings(data_dir=folder, cancel_grace_s=1.0, **settings)
-    scheduler = Scheduler(asked, Catalog(asked), worker="job_worker")
+    scheduler = Scheduler(asked, Catalog(asked), worker="support.server.job_worker")
     with patch.object(scheduler_module, "_SWEEP_INTERVAL_S", 0.3):
         scheduler.start()
         try:

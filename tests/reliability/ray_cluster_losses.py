@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from ray_cluster import RAY, RealCluster, real_cluster
+from support.server.ray_cluster import RAY, RealCluster, real_cluster
 
 from physhandi.run import Run
 from reliability import Case, Report

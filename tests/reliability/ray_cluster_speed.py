@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 
 import psutil
-from ray_cluster import RAY, RealCluster, real_cluster
-from sheet_sequence import write_sheet
-from suite_world import SETTINGS
+from support.inputs.sheet_sequence import write_sheet
+from support.server.ray_cluster import RAY, RealCluster, real_cluster
+from support.server.suite_world import SETTINGS
 
 from app.jobs.catalog import Catalog
 from app.jobs.processes import WORKER

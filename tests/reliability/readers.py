@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from damaged_files import damage_file
+from support.hostile.damaged_files import damage_file
 
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.uploads import Uploads

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-from queue_world import queue_world, serving
-from sheet_sequence import write_sheet
-from waiting import until
+from support.inputs.sheet_sequence import write_sheet
+from support.server.queue_world import queue_world, serving
+from support.waiting import until
 
 from app.jobs.catalog import Catalog
 from app.jobs.processes import end_processes, processes_of, supervisor_of
@@ -41,7 +41,7 @@ class Server:
     def start(self) -> None:
         """Start it, also again."""
         self._process = subprocess.Popen(
-            [sys.executable, str(TESTS / "queue_server.py"), str(self._folder)],
+            [sys.executable, str(TESTS / "support/server/queue_server.py"), str(self._folder)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

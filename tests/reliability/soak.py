@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measured_server import Held, MeasuredServer
-from server_world import fit_sheet
-from sheet_sequence import FRAMES, write_sheet
-from suite_world import SETTINGS
-from waiting import until
+from support.inputs.sheet_sequence import FRAMES, write_sheet
+from support.server.measured_server import Held, MeasuredServer
+from support.server.server_world import fit_sheet
+from support.server.suite_world import SETTINGS
+from support.waiting import until
 
 from app.jobs.processes import processes_of, supervisor_of
 from app.jobs.recovery.left_behind import find_left_behind

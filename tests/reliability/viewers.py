@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measured_server import MeasuredServer
 from numpy import ndarray
-from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, controls, make_run, sheet, show_parts
-from waiting import until
+from support.server.measured_server import MeasuredServer
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FRAMES, PARAMETERS, controls, make_run, sheet, show_parts
+from support.waiting import until
 from websockets.sync.connection import Connection
 
 from physhandi.simulation.simulator import Simulator

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic_world import lifted_sheet
-from waiting import LIMIT_S
+from support.physics.synthetic_world import lifted_sheet
+from support.waiting import LIMIT_S
 
 from app import cli
 from app.benchmarks import capture

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_WORK
-from small_pictures import place_pictures
+from support.browser.scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_WORK
+from support.browser.small_pictures import place_pictures
 
 from app import cli
 from app.benchmarks import browser, latency, splats, streams, viewer

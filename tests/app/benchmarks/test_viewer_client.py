@@ -5,7 +5,7 @@ import threading
 from contextlib import suppress
 from typing import cast
 
-from waiting import LIMIT_S
+from support.waiting import LIMIT_S
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol

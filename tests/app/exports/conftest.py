@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from server_world import World
+from support.server.server_world import World
 
 from app.exports.cache import FileCache, FileJob
 from app.exports.making import make

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import psutil
 import pytest
-from server_world import World
-from waiting import LIMIT_S
+from support.server.server_world import World
+from support.waiting import LIMIT_S
 
 from app.exports import cache as cache_module
 from app.exports.cache import FileCache, FileJob, TooManyFilesError

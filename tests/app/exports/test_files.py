@@ -10,9 +10,9 @@ import cv2
 import jsonschema
 import numpy as np
 import pytest
-from gltf_player import Player
-from server_world import World
-from viser_file import Recording
+from support.server.server_world import World
+from support.viewer.gltf_player import Player
+from support.viewer.viser_file import Recording
 
 from app.exports.request import FileRequest
 from app.exports.schema import MEDIA_TYPES

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
-from server_world import World
+from support.server.server_world import World
 
 from app.cli import main
 from app.exports import gallery

@@ -4,7 +4,7 @@ from dataclasses import replace
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
-from server_world import World
+from support.server.server_world import World
 
 from app.viewer.physics.panel import PhysicsPanel
 from physhandi.simulation.edits import Cut

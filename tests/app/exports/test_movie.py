@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import PIL.Image
 import pytest
-from server_world import World
+from support.server.server_world import World
 
 from app.cli import main
 from app.exports.files import request_of

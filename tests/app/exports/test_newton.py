@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hanging_node import hanging_node, scene_of, unpacked
-from server_world import World
+from support.physics.hanging_node import hanging_node, scene_of, unpacked
+from support.server.server_world import World
 
 from app.cli import main
 from app.settings import BUNDLED

@@ -7,9 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from server_world import World
-from splat_world import splats_on
-from viewer_world import FolderCatalog
+from support.server.server_world import World
+from support.viewer.splat_world import splats_on
+from support.viewer.viewer_world import FolderCatalog
 
 from app.exports.making import make
 from app.exports.permalink import state_from_query

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from viewer_world import content_of
-from viser_file import Recording
+from support.viewer.viewer_world import content_of
+from support.viewer.viser_file import Recording
 
 from app.exports.offscreen import GRID
 from app.exports.permalink import state_from_query

@@ -3,9 +3,9 @@
 from typing import Any
 from urllib.parse import quote
 
-from server_world import World
-from viser_file import Recording
-from waiting import until
+from support.server.server_world import World
+from support.viewer.viser_file import Recording
+from support.waiting import until
 
 from app.exports.request import FileRequest
 

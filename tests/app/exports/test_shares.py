@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from server_world import World, make_world
+from support.server.server_world import World, make_world
 
 from app.exports import shares
 from app.exports.request import FileRequest

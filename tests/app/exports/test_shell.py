@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-from server_world import World
-from viser_file import Recording
+from support.server.server_world import World
+from support.viewer.viser_file import Recording
 
 from app.cli import main
 from app.exports.shell import ExportOptions, export, read_link

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from queue_world import QueueWorld, queue_world
+from support.server.queue_world import QueueWorld, queue_world
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import yaml
-from queue_world import HOSTILE, QueueWorld
-from server_world import World
+from support.server.queue_world import HOSTILE, QueueWorld
+from support.server.server_world import World
 
 from physhandi.fitting.config import PipelineConfig, load_profile
 from physhandi.run import Run

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from queue_world import HOSTILE, QueueWorld, serving
-from server_world import World
-from waiting import LIMIT_S, until
+from support.server.queue_world import HOSTILE, QueueWorld, serving
+from support.server.server_world import World
+from support.waiting import LIMIT_S, until
 
 from physhandi.data.attempt import PREVIEW, PreviewFile
 from physhandi.progress import Preview

@@ -3,8 +3,14 @@ from pathlib import Path
 
 import pytest
 import viser
-from viewer_client import ViewerClient
-from viewer_world import FakeSettings, FolderCatalog, Recording, make_run, make_sequence
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import (
+    FakeSettings,
+    FolderCatalog,
+    Recording,
+    make_run,
+    make_sequence,
+)
 
 from app.viewer.physics.edit_presets import EditPresetStore
 from app.viewer.physics.keep_panel import RunSaver, UserStorage

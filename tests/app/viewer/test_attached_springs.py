@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from spring_world import content_of, two_springs
+from support.physics.spring_world import content_of, two_springs
 
 from app.viewer.color.coloring import Painter
 from app.viewer.content.layers import Layers

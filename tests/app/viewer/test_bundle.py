@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from viewer_world import FRAMES, PARAMETERS, content_of, controls, look_at
+from support.viewer.viewer_world import FRAMES, PARAMETERS, content_of, controls, look_at
 
 from app.viewer.content.layers import Layers
 from app.viewer.content.session_state import Pose

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import rest_at
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import rest_at
 
 from app.viewer.content.camera_path import (
     PATH_FORMAT,

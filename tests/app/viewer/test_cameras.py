@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from viewer_world import Recording
+from support.viewer.viewer_world import Recording
 
 from app.viewer.content.content import open_sequence_content
 from app.viewer.scene.cameras import CameraNodes, Lens

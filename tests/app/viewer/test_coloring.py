@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from spring_world import content_of, two_springs
-from viewer_world import FolderCatalog
+from support.physics.spring_world import content_of, two_springs
+from support.viewer.viewer_world import FolderCatalog
 
 from app.viewer.color.coloring import Painter
 from app.viewer.color.colormaps import UNKNOWN, levels, paint_values, table

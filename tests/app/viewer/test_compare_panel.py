@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import viser
-from waiting import LIMIT_S
+from support.waiting import LIMIT_S
 
 from app.viewer.color.difference import FrameDifference, Way
 from app.viewer.compare.curve import DifferenceCurve

@@ -7,8 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, hear_all, make_run
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import (
+    FRAMES,
+    PARAMETERS,
+    FakeSettings,
+    FolderCatalog,
+    hear_all,
+    make_run,
+)
 
 from app.viewer.compare.drawing import GHOST
 from app.viewer.compare.pair import open_pair

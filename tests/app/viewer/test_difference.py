@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy import ndarray
-from viewer_world import FRAMES, PARAMETERS, content_of, controls, sheet
+from support.viewer.viewer_world import FRAMES, PARAMETERS, content_of, controls, sheet
 
 from app.viewer.color.difference import (
     compare_frames,

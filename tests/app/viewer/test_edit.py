@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from spring_world import two_springs
-from viewer_client import ViewerClient
-from viewer_world import rest_at
-from waiting import LIMIT_S
+from support.physics.spring_world import two_springs
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import rest_at
+from support.waiting import LIMIT_S
 
 from app.viewer.content.session_state import Pose
 from app.viewer.edit import selection

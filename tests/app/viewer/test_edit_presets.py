@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from spring_world import two_springs
-from viewer_client import ViewerClient
-from viewer_world import FolderCatalog
-from waiting import until
+from support.physics.spring_world import two_springs
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FolderCatalog
+from support.waiting import until
 
 from app.viewer.physics.edit_presets import (
     EditPreset,

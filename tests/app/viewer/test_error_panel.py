@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import (
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import (
     FRAMES,
     PARAMETERS,
     FakeSettings,

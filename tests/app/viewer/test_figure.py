@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy import ndarray
-from viewer_client import ViewerClient
-from viewer_world import (
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import (
     FRAMES,
     PARAMETERS,
     FakeSettings,

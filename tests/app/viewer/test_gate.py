@@ -15,9 +15,9 @@ import pytest
 import uvicorn
 import viser._messages
 from fastapi import FastAPI
-from viewer_client import PROTOCOL, ViewerClient
-from viewer_world import FRAMES, hear_all, rest_at
-from waiting import LIMIT_S, until
+from support.viewer.viewer_client import PROTOCOL, ViewerClient
+from support.viewer.viewer_world import FRAMES, hear_all, rest_at
+from support.waiting import LIMIT_S, until
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import PARAMETERS, hear_all, rest_at, show_parts
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import PARAMETERS, hear_all, rest_at, show_parts
 
 from app.keys import KEYS, LAYER_KEYS, Key
 from app.viewer.color.colormaps import table

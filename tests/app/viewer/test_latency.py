@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_world import FRAMES
+from support.viewer.viewer_world import FRAMES
 
 from app.benchmarks import latency
 from app.benchmarks.latency import measure_latency

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from viewer_world import content_of, controls
+from support.viewer.viewer_world import content_of, controls
 
 from app.viewer.color.coloring import Painter
 from app.viewer.color.legend import Legend, draw_legend

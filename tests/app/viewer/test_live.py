@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from viewer_world import FRAMES, PARAMETERS, controls, sheet
-from waiting import LIMIT_S, until
+from support.viewer.viewer_world import FRAMES, PARAMETERS, controls, sheet
+from support.waiting import LIMIT_S, until
 
 from app.viewer.live.client import LiveRequest, SimulationClient, _message
 from app.viewer.live.drive import HandLimits, HandOrder

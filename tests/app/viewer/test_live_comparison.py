@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import FRAMES, FakeSettings, FolderCatalog
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FRAMES, FakeSettings, FolderCatalog
 
 from app.exports.permalink import state_from_query
 from app.viewer.sessions import Sessions

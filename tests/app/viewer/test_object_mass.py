@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from spring_world import content_of, two_springs
+from support.physics.spring_world import content_of, two_springs
 
 from app.viewer.color.coloring import Painter
 from app.viewer.compare.drawing import written_newtons

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from viewer_world import FolderCatalog
+from support.viewer.viewer_world import FolderCatalog
 
 from app.previews.links import marker_links
 from app.settings import BUNDLED

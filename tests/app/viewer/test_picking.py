@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from viewer_world import content_of, controls
+from support.viewer.viewer_world import content_of, controls
 
 from app.viewer.content.layers import Layers
 from app.viewer.inspect.picking import Pick, Ray, Target, first_triangle, nearest_on_segments, pick

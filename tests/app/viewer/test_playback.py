@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from waiting import until
+from support.waiting import until
 
 from app.viewer.clock.playback import Playback
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hanging_node import hanging_node
-from spring_world import content_of, two_springs
-from viewer_world import content_of as sheet_with_hands
-from viewer_world import controls
+from support.physics.hanging_node import hanging_node
+from support.physics.spring_world import content_of, two_springs
+from support.viewer.viewer_world import content_of as sheet_with_hands
+from support.viewer.viewer_world import controls
 
 from app.viewer.color.coloring import Painter
 from app.viewer.color.legend import ColorScale, Legend, legend_head, legend_html, number

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
-from spring_world import content_of, two_springs
-from viewer_client import ViewerClient
-from viewer_world import FRAMES, FakeSettings, FolderCatalog, make_run
+from support.physics.spring_world import content_of, two_springs
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FRAMES, FakeSettings, FolderCatalog, make_run
 
 from app.exports.making import load_rollout, store_rollout
 from app.viewer.clock.restart_mark import mark_html, restart_frame

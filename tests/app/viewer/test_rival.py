@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy import ndarray
-from viewer_world import FRAMES, PARAMETERS, Recording, content_of, controls
+from support.viewer.viewer_world import FRAMES, PARAMETERS, Recording, content_of, controls
 
 from app.viewer.compare.phystwin_baseline import PhysTwinBaseline
 from app.viewer.content.content import Content

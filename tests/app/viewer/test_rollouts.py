@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from viewer_world import FRAMES, PARAMETERS
+from support.viewer.viewer_world import FRAMES, PARAMETERS
 
 from app.viewer.live.client import LiveRequest, LiveRollouts
 from app.viewer.live.wire import Message

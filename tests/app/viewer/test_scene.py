@@ -3,8 +3,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import viser
-from viewer_client import ViewerClient
-from viewer_world import hear_all
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import hear_all
 
 from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import PLAYING_SPRINGS

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import FRAMES, FakeSettings
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FRAMES, FakeSettings
 
 from app.exports.permalink import state_from_query
 from app.viewer.compare.live import LiveComparison

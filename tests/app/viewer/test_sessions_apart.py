@@ -8,8 +8,8 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import (
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import (
     FRAMES,
     PARAMETERS,
     FakeSettings,
@@ -19,7 +19,7 @@ from viewer_world import (
     sheet,
     show_parts,
 )
-from waiting import WatchedLock, until
+from support.waiting import WatchedLock, until
 
 from app.viewer import session
 from app.viewer.live.client import STARTING

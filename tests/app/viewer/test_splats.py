@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
-from splat_world import splats_on, splats_seen
-from viewer_client import ViewerClient
-from viewer_world import FolderCatalog, hear_all, make_run, rest_at, sheet
+from support.viewer.splat_world import splats_on, splats_seen
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FolderCatalog, hear_all, make_run, rest_at, sheet
 
 from app.exports.permalink import state_from_query
 from app.viewer.content.content import open_run_content

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import FakeSettings, FolderCatalog, rest_at
-from waiting import LIMIT_S, until
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FakeSettings, FolderCatalog, rest_at
+from support.waiting import LIMIT_S, until
 
 from app.settings import BUNDLED
 from app.viewer.session import Session

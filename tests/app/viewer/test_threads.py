@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, hear_all, rest_at
-from waiting import LIMIT_S as PATIENCE
-from waiting import WatchedLock, until
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FRAMES, PARAMETERS, hear_all, rest_at
+from support.waiting import LIMIT_S as PATIENCE
+from support.waiting import WatchedLock, until
 
 from app.viewer.compare.camera import Eye
 from app.viewer.content.content import Content

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS
-from waiting import LIMIT_S, until
+from support.viewer.viewer_client import ViewerClient
+from support.viewer.viewer_world import FRAMES, PARAMETERS
+from support.waiting import LIMIT_S, until
 
 from app.viewer.physics.history import TriedSetting
 from app.viewer.physics.keep_panel import SavedRun, run_changes

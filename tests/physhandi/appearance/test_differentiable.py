@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from reference.splats import draw
-from splat_scene import askew_camera, random_splats
+from support.physics.splat_scene import askew_camera, random_splats
 
 from physhandi.appearance.differentiable import draw_splats
 from physhandi.appearance.rasterise import render_splats

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from splat_scene import askew_camera, random_splats
+from support.physics.splat_scene import askew_camera, random_splats
 
 from physhandi.appearance.differentiable import draw_splats
 from physhandi.appearance.gsplat_backend import draw_splats_by_gsplat, is_installed

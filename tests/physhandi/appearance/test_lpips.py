@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from foreign_pickle import Call, Global, python2_pickle
-from lpips_weights import (
+from safetensors.numpy import save_file
+from support.hostile.foreign_pickle import Call, Global, python2_pickle
+from support.inputs.lpips_weights import (
     ALEXNET,
     Weights,
     alexnet_weights,
@@ -15,7 +16,6 @@ from lpips_weights import (
     write_lpips,
     write_weights,
 )
-from safetensors.numpy import save_file
 
 from physhandi.appearance.lpips import Lpips, user_lpips
 from physhandi.errors import UsageError

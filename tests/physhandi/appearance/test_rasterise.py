@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reference.splats import draw
-from splat_scene import askew_camera, random_splats
+from support.physics.splat_scene import askew_camera, random_splats
 
 from physhandi.appearance.rasterise import render_splats
 from physhandi.appearance.splats import Splats

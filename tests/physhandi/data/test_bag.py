@@ -6,8 +6,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from raw_capture import BOARD, CAMERAS, RawCapture, camera_at, picture
-from recorded_bag import TREE, Recorder, jpeg, png, shown, time_of, write_realsense_bag
+from support.inputs.raw_capture import BOARD, CAMERAS, RawCapture, camera_at, picture
+from support.inputs.recorded_bag import (
+    TREE,
+    Recorder,
+    jpeg,
+    png,
+    shown,
+    time_of,
+    write_realsense_bag,
+)
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers import bag as bag_reader

@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from bundled_recording import FRAMES, SIZE, shrink, smaller
-from recordings import recording as published
+from support.inputs.bundled_recording import FRAMES, SIZE, shrink, smaller
+from support.inputs.recordings import recording as published
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.layout import SequenceFiles

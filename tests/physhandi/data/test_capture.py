@@ -11,7 +11,16 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
-from raw_capture import BOARD, CAMERAS, FRAMES, RawCapture, ball, camera_at, intrinsics, picture
+from support.inputs.raw_capture import (
+    BOARD,
+    CAMERAS,
+    FRAMES,
+    RawCapture,
+    ball,
+    camera_at,
+    intrinsics,
+    picture,
+)
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers.board_calibration import AprilGrid, CharucoTarget, find_board

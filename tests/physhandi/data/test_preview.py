@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from run_world import make_run
 from safetensors import safe_open
+from support.server.run_world import make_run
 
 from physhandi.data import attempt as preview_module
 from physhandi.data.attempt import PREVIEW, PreviewFile, encode

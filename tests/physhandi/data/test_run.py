@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from run_world import fill, make_run
-from waiting import LIMIT_S
+from support.server.run_world import fill, make_run
+from support.waiting import LIMIT_S
 
 from physhandi.data import attempt as attempt_module
 from physhandi.data import lease

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from run_world import fill, make_run
+from support.server.run_world import fill, make_run
 
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import new_run_id, read_events

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 from safetensors.numpy import load_file
-from waiting import until
+from support.waiting import until
 
 from physhandi.data.run_folder import attempt_numbers, read_events
 from physhandi.run import Run

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_scene import grasping, looking_at_hand, write_scene
-from run_world import make_run
 from scipy.spatial import cKDTree
+from support.physics.hand_scene import grasping, looking_at_hand, write_scene
+from support.server.run_world import make_run
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.fitting.artefacts import (

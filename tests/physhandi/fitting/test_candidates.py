@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from waiting import LIMIT_S
+from support.waiting import LIMIT_S
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError, SimulationDivergedError

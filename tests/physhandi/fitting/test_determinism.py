@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hand_scene import grasping
+from support.physics.hand_scene import grasping
 
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, RefinementConfig

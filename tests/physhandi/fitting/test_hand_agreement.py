@@ -3,9 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-import hand_scene as scene
 import numpy as np
 import pytest
+from support.physics import hand_scene as scene
 
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.hand_reconstruction import reconstruct_hands

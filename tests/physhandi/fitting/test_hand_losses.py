@@ -3,10 +3,10 @@
 import math
 from pathlib import Path
 
-import hand_scene as scene
 import numpy as np
 import pytest
 import torch
+from support.physics import hand_scene as scene
 
 from physhandi.data.camera import PinholeCamera, triangulate
 from physhandi.fitting.hands.losses import (

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hand_scene import grasping
 from scipy.spatial.transform import Rotation
+from support.physics.hand_scene import grasping
 
 from physhandi.adam import Adam
 from physhandi.fitting.hand_refinement import HandOffsets, OffsetDescent, control_nodes

@@ -5,13 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
-import hand_scene as scene
 import numpy as np
 import pytest
 import torch
-from recordings import recording
 from scipy.spatial.transform import Rotation
-from stopped_fits import check_resumed, write_always
+from support.inputs.recordings import recording
+from support.physics import hand_scene as scene
+from support.physics.stopped_fits import check_resumed, write_always
 
 import physhandi as ph
 from physhandi.data.checkpoint import Checkpointer

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hand_scene import grasping, looking_at_hand, seen_keypoints
 from reference.spring_mass import Scene, simulate
-from refinement_world import SOFT, held_patch, moved, mpjpe
 from scipy.spatial.transform import Rotation
-from stopped_fits import check_resumed, write_always
+from support.physics.hand_scene import grasping, looking_at_hand, seen_keypoints
+from support.physics.refinement_world import SOFT, held_patch, moved, mpjpe
+from support.physics.stopped_fits import check_resumed, write_always
 
 from physhandi.data.checkpoint import Checkpointer
 from physhandi.errors import CancelledError, SettingsError, SimulationDivergedError

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bundled_sequence import FRAME_RATE
-from refinement_world import mpjpe, mpvpe, with_error
+from support.inputs.bundled_sequence import FRAME_RATE
+from support.physics.refinement_world import mpjpe, mpvpe, with_error
 
 from physhandi.fitting import artefacts, hand_refinement
 from physhandi.fitting.hand_refinement import (

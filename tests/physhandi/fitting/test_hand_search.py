@@ -3,10 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-import hand_scene as scene
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from support.physics import hand_scene as scene
 
 from physhandi.data.sequence import Sequence
 from physhandi.fitting.config import HandFitConfig

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-import hand_scene as scene
 import numpy as np
 import pytest
 import torch
 from numpy import ndarray
+from support.physics import hand_scene as scene
 
 from physhandi.fitting.hand_reconstruction import HandFitConfig, reconstruct_hands
 from physhandi.fitting.hands.smoothing import (

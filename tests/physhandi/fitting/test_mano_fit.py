@@ -4,11 +4,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import hand_scene as scene
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial import cKDTree
+from support.physics import hand_scene as scene
 
 from physhandi import pipeline
 from physhandi.data.exporters import export_run

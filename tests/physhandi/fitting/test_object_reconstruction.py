@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stopped_fits import ORIGIN, check_resumed, same_bits, write_always
+from support.physics.stopped_fits import ORIGIN, check_resumed, same_bits, write_always
 
 from physhandi.data.checkpoint import Checkpointer, FileCheckpointer
 from physhandi.data.observation import ObjectObservation

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from phystwin_experiment import OPTIMUM, find_springs
+from support.inputs.phystwin_experiment import OPTIMUM, find_springs
 
 from physhandi.data.importers.phystwin_experiment import Checkpoint, Contact, Optimum
 from physhandi.errors import ImportFailedError

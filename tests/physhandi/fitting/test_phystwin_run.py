@@ -6,9 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from phystwin_case import FRAMES, Case, edit_pickle, save_pickle, write_case
-from phystwin_experiment import OPTIMUM, Experiment, save_checkpoint, write_experiment
-from sheet_sequence import write_sheet
+from support.inputs.phystwin_case import FRAMES, Case, edit_pickle, save_pickle, write_case
+from support.inputs.phystwin_experiment import (
+    OPTIMUM,
+    Experiment,
+    save_checkpoint,
+    write_experiment,
+)
+from support.inputs.sheet_sequence import write_sheet
 
 from app.viewer.content.content import open_run_content
 from physhandi import pipeline

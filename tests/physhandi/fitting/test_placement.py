@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from run_world import make_run
 from scipy.spatial.transform import Rotation
+from support.server.run_world import make_run
 
 import physhandi as ph
 from physhandi.data.sequence_meta import SequenceMeta

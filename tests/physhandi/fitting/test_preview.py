@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hand_scene import grasping, looking_at_hand, seen_keypoints, write_scene
-from refinement_world import held_patch, moved
+from support.physics.hand_scene import grasping, looking_at_hand, seen_keypoints, write_scene
+from support.physics.refinement_world import held_patch, moved
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bad_input_world import FILMED_FRAMES, write_filmed
-from sheet_sequence import write_sheet
+from support.hostile.bad_input_world import FILMED_FRAMES, write_filmed
+from support.inputs.sheet_sequence import write_sheet
 
 from physhandi.data.sequence import Sequence
 from physhandi.fitting.checks.readiness import nothing_to_fit, readiness, shows_palm, skipped_object

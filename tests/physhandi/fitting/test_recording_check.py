@@ -8,8 +8,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from bad_input_world import FILMED_FRAMES, both, image, put, removed, truncated, write_filmed
-from sheet_sequence import write_sheet
+from support.hostile.bad_input_world import (
+    FILMED_FRAMES,
+    both,
+    image,
+    put,
+    removed,
+    truncated,
+    write_filmed,
+)
+from support.inputs.sheet_sequence import write_sheet
 
 import physhandi as ph
 from physhandi.errors import CancelledError

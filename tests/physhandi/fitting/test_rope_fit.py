@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from stopped_fits import check_resumed, write_always
+from support.physics.stopped_fits import check_resumed, write_always
 
 from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.importers.mocap import held_point

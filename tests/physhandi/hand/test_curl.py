@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_scene import flat_and_bent
 from scipy.spatial.transform import Rotation
+from support.physics.hand_scene import flat_and_bent
 
 from physhandi.hand.curl import BONE_OF_KEYPOINT, blended, curl_motion, curled_rotations
 from physhandi.hand.loading import load_hand_model

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from hand_scene import flat_and_bent
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
+from support.physics.hand_scene import flat_and_bent
 
 from physhandi.hand.curl import (
     BONE_OF_KEYPOINT,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mano_file import JOINTS, TO_MANO, mano_arrays, posed_mano
+from support.inputs.mano_file import JOINTS, TO_MANO, mano_arrays, posed_mano
 
 from physhandi.errors import MissingInputError
 from physhandi.hand.loading import load_hand_model

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from clicked_disc import FRAMES, disc_click, write_disc
+from support.inputs.clicked_disc import FRAMES, disc_click, write_disc
 
 import physhandi
 from physhandi.data.sequence import Sequence

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clicked_disc import FRAMES, HEIGHT, WIDTH, cameras, joints, write_disc
-from mano_file import mano_arrays, posed_mano
 from scipy.spatial.transform import Rotation
+from support.inputs.clicked_disc import FRAMES, HEIGHT, WIDTH, cameras, joints, write_disc
+from support.inputs.mano_file import mano_arrays, posed_mano
 
 from physhandi.data.sequence import Sequence
 from physhandi.errors import ImportFailedError, MissingInputError, UsageError

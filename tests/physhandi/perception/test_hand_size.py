@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from clicked_disc import disc_click, write_disc
+from support.inputs.clicked_disc import disc_click, write_disc
 
 import physhandi as ph
 from physhandi.data.depth_scale import likely_scales

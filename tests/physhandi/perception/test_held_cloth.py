@@ -1,11 +1,11 @@
 """A cloth that hands hold up before a wall: from depth images and masks to its nodes."""
 
 import cv2
-import made_clouds as made
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, KDTree
+from support.inputs import made_clouds as made
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.observation import ObjectObservation

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import recording
+from support.inputs.recordings import recording
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta

@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 import torch
-from clicked_disc import FRAMES, HEIGHT, WIDTH, disc_click, write_disc
-from made_models import SIDE, write_edgetam, write_sam2
+from support.inputs.clicked_disc import FRAMES, HEIGHT, WIDTH, disc_click, write_disc
+from support.inputs.made_models import SIDE, write_edgetam, write_sam2
 
 from physhandi.errors import UsageError
 from physhandi.perception.annotation import annotate

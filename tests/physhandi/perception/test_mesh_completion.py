@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from half_seen_body import (
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from support.inputs.half_seen_body import (
     EYES,
     TURN,
     UNIT,
@@ -16,8 +18,6 @@ from half_seen_body import (
     write_half_seen,
     write_mesh,
 )
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError, SequenceError, UsageError

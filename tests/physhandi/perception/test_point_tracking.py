@@ -3,7 +3,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from clicked_disc import FRAMES, TOP, cameras, center, write_disc
+from support.inputs.clicked_disc import FRAMES, TOP, cameras, center, write_disc
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from clicked_disc import (
+from support.inputs.clicked_disc import (
     ABOVE_HAND,
     FRAMES,
     HEIGHT,

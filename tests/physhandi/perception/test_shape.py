@@ -3,11 +3,11 @@
 from dataclasses import replace
 from functools import cache
 
-import made_clouds as made
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from support.inputs import made_clouds as made
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.sequence import Sequence

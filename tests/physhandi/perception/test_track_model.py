@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from clicked_disc import FRAMES, TOP, cameras, center, disc_click, write_disc
-from made_models import BREAKS_OFF, write_cotracker, write_tapnext
+from support.inputs.clicked_disc import FRAMES, TOP, cameras, center, disc_click, write_disc
+from support.inputs.made_models import BREAKS_OFF, write_cotracker, write_tapnext
 
 from physhandi.errors import RunError, UsageError
 from physhandi.perception.annotation import annotate

@@ -5,9 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
-from render_world import camera, crowd
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
+from support.physics.render_world import camera, crowd
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.rendering.renderer import Raster, rasterize

@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
-from render_world import crowd
 from scipy.spatial.transform import Rotation
+from support.physics.render_world import crowd
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.rendering import renderer

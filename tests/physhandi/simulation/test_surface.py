@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from measured_triangles import area, directed_edges, euler, grid, volume
+from support.physics.measured_triangles import area, directed_edges, euler, grid, volume
 
 from physhandi.simulation.surface import triangulate_nodes
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
-from property_tests import SAME_EVERYWHERE
+from support.property_tests import SAME_EVERYWHERE
 
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.blocks import PARAMETERS, thrown_block
-from waiting import LIMIT_S
+from support.waiting import LIMIT_S
 
 from physhandi.simulation.engines import cpu
 from physhandi.simulation.engines.cpu import FIRST_PAUSE, TRIAL, Pace

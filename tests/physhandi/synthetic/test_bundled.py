@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from bundled_sequence import Recipe, Truth, generate_bundled, make_truth
 from scipy.spatial import cKDTree
+from support.inputs.bundled_sequence import Recipe, Truth, generate_bundled, make_truth
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.sequence import Sequence

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from filmed_sheet import write_filmed_sheet
-from lpips_weights import write_lpips
-from sheet_sequence import FITTED, NODE, write_sheet
-from suite_world import SETTINGS
+from support.inputs.filmed_sheet import write_filmed_sheet
+from support.inputs.lpips_weights import write_lpips
+from support.inputs.sheet_sequence import FITTED, NODE, write_sheet
+from support.server.suite_world import SETTINGS
 
 import physhandi
 from physhandi import pipeline

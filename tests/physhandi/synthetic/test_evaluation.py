@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sheet_sequence import FACES, FITTED
-from suite_world import SETTINGS, order_of, table, write_told
+from support.inputs.sheet_sequence import FACES, FITTED
+from support.server.suite_world import SETTINGS, order_of, table, write_told
 
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-from sheet_sequence import FRAMES, write_sheet
+from support.inputs.sheet_sequence import FRAMES, write_sheet
 
 from physhandi import pipeline
 from physhandi.data.camera import PinholeCamera

@@ -6,8 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from sheet_sequence import FACES, FITTED, FRAMES, NODE
-from suite_world import write_told
+from support.inputs.sheet_sequence import FACES, FITTED, FRAMES, NODE
+from support.server.suite_world import write_told
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.run import RunFolder

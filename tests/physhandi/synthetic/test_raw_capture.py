@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from raw_capture import camera_at, picture
+from support.inputs.raw_capture import camera_at, picture
 
 from physhandi.data.importers.capture import import_capture
 from physhandi.data.sequence import Sequence, ViewMeta

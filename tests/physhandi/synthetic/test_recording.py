@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from synthetic_world import bare_hands, distance_to_sheet, lifted_sheet
+from support.physics.synthetic_world import bare_hands, distance_to_sheet, lifted_sheet
 
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from synthetic_world import bare_hands, lifted_sheet
+from support.physics.synthetic_world import bare_hands, lifted_sheet
 
 from physhandi.synthetic.film.cameras import make_viewpoints, window_around
 from physhandi.synthetic.film.degradations import Degradations

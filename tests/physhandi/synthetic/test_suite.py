@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sheet_sequence import write_sheet
+from support.inputs.sheet_sequence import write_sheet
 
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_writer import write_sequence

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from suite_world import order_of, table, write_told
+from support.server.suite_world import order_of, table, write_told
 
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, UsageError

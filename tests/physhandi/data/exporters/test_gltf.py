@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gltf_player import Player
-from moving_scene import FRAMES, RATE, SPRINGS, pyramid, write_run
 from pygltflib import GLTF2
+from support.physics.moving_scene import FRAMES, RATE, SPRINGS, pyramid, write_run
+from support.viewer.gltf_player import Player
 
 from physhandi.data.exporters import export_run
 from physhandi.errors import UsageError

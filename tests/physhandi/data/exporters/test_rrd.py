@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import PIL.Image
 import pytest
-from moving_scene import FRAMES, NODES, RATE, ROLLOUT, SPRINGS, pyramid, write_run
+from support.physics.moving_scene import FRAMES, NODES, RATE, ROLLOUT, SPRINGS, pyramid, write_run
 
 from app.cli import main
 from app.settings import BUNDLED

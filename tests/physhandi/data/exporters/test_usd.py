@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from moving_scene import FRAMES, NODES, RATE, pyramid, write_run
+from support.physics.moving_scene import FRAMES, NODES, RATE, pyramid, write_run
 
 from physhandi.data.exporters import export_run
 from physhandi.errors import UsageError

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from foreign_pickle import Call, Global
-from mano_file import mano_arrays, write_mano
+from support.hostile.foreign_pickle import Call, Global
+from support.inputs.mano_file import mano_arrays, write_mano
 
 from physhandi.data.importers.mano import import_mano
 from physhandi.errors import ImportFailedError

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from phystwin_case import (
+from support.inputs.phystwin_case import (
     FRAMES,
     HEIGHT,
     TRAIN,

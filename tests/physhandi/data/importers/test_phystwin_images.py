@@ -5,9 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from header_bombs import png
-from phystwin_case import FRAMES, HEIGHT, WIDTH, Case, edit_json, write_case, write_video
-from phystwin_damage import Damage, array_file, image_file, moved, refuse, tracks
+from support.hostile.header_bombs import png
+from support.inputs.phystwin_case import (
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    Case,
+    edit_json,
+    write_case,
+    write_video,
+)
+from support.inputs.phystwin_damage import Damage, array_file, image_file, moved, refuse, tracks
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from phystwin_case import Case, edit_json, edit_pickle, save_pickle, write_case
-from phystwin_damage import Damage, final, load, metadata, pickle_file, put, refuse, split
+from support.inputs.phystwin_case import Case, edit_json, edit_pickle, save_pickle, write_case
+from support.inputs.phystwin_damage import (
+    Damage,
+    final,
+    load,
+    metadata,
+    pickle_file,
+    put,
+    refuse,
+    split,
+)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import cv2
 import lzfse
 import numpy as np
 import pytest
-from raw_capture import camera_at, picture
+from support.inputs.raw_capture import camera_at, picture
 
 from physhandi.data.importers.capture import import_capture
 from physhandi.data.importers.record3d import unpack_record3d

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from header_bombs import mp4
+from support.hostile.header_bombs import mp4
 
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.errors import ImportFailedError, UsageError

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from raw_capture import RawCapture, ball, camera_at, picture, rays
+from support.inputs.raw_capture import RawCapture, ball, camera_at, picture, rays
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers.board_calibration import CharucoTarget

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from header_bombs import exr
+from support.hostile.header_bombs import exr
 
 from physhandi.data.untrusted.exr import (
     depth_channels,

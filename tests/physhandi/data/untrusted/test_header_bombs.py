@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from header_bombs import jpeg, mp4, png
+from support.hostile.header_bombs import jpeg, mp4, png
 
 from physhandi.data.arrays import read_array
 from physhandi.data.camera import PinholeCamera

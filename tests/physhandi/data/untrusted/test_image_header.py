@@ -5,7 +5,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from header_bombs import exr, png
+from support.hostile.header_bombs import exr, png
 
 from physhandi.data.untrusted.image_header import announced_size, is_whole_video
 

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from waiting import LIMIT_S
+from support.waiting import LIMIT_S
 
 from physhandi.data.untrusted.media import MediaDecoder, media_decoder
 from physhandi.errors import ImportFailedError
@@ -56,7 +56,7 @@ def test_frames_of_several_videos_are_given_in_any_order(tmp_path):
 def hostile(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", __file__.rpartition("/tests/")[0] + "/tests")
-        decoder = MediaDecoder(worker="hostile_decoder", longest_s=LIMIT_S)
+        decoder = MediaDecoder(worker="support.hostile.hostile_decoder", longest_s=LIMIT_S)
         folder = tmp_path_factory.mktemp("media")
         for name in ("crash", "hang", "greedy", "once", "good"):
             write_png(folder / f"{name}.png")

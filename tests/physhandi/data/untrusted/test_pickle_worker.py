@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import scipy.sparse
 import torch
-from foreign_pickle import chumpy_select, python2_pickle
-from hostile_pickles import BROKEN, EXPLODING, canaries
-from waiting import LIMIT_S
+from support.hostile.foreign_pickle import chumpy_select, python2_pickle
+from support.hostile.hostile_pickles import BROKEN, EXPLODING, canaries
+from support.waiting import LIMIT_S
 
 from physhandi.data.untrusted.pickles import array_from_bytes, convert
 from physhandi.errors import ImportFailedError

@@ -11,8 +11,8 @@ import psutil
 import pytest
 import scipy.sparse
 import torch
-from foreign_pickle import chumpy_array, chumpy_select, python2_pickle
-from hostile_pickles import BROKEN, EXPLODING, Hostile, canaries
+from support.hostile.foreign_pickle import chumpy_array, chumpy_select, python2_pickle
+from support.hostile.hostile_pickles import BROKEN, EXPLODING, Hostile, canaries
 
 from physhandi.data.untrusted.pickles import read_untrusted
 from physhandi.errors import ImportFailedError

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grippers import Gripper, PinchAndLift
+from support.physics.grippers import Gripper, PinchAndLift
 
 from physhandi.errors import CancelledError, SimulationDivergedError, UsageError
 from physhandi.progress import Progress

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from viewer_client import ViewerClient
 
 from app.benchmarks.served import Served
+from support.viewer.viewer_client import ViewerClient
 
 
 @dataclass(frozen=True)

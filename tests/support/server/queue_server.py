@@ -15,7 +15,7 @@ from app.settings import ServerSettings
 def main() -> None:
     settings = ServerSettings(data_dir=Path(sys.argv[1]), parallel_fits=2)
     catalog = Catalog(settings)
-    scheduler = Scheduler(settings, catalog, worker="job_worker")
+    scheduler = Scheduler(settings, catalog, worker="support.server.job_worker")
     scheduler.start()
 
     def tell() -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from server_world import World, make_world
 
 from app import cli
+from support.server.server_world import World, make_world
 
-FIXTURE = Path(__file__).parent / "compatibility"
+FIXTURE = Path(__file__).parents[2] / "compatibility"
 MADE_AT = "/srv/physhandi/data"
 """Where the folder was when it was made; files of a run name recordings by this path."""
 SAME_MOTION_M = 1e-5

@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
-from waiting import until
 
 from app.jobs.engines.cluster import Cluster, ClusterError, Demand
+from support.waiting import until
 
 RAY = Path(sys.executable).parent / "ray"
 NEEDED = "needs Ray beside this Python: pip install 'physhandi[cluster]'"
@@ -166,7 +166,7 @@ def real_cluster() -> Iterator[RealCluster]:
     environment = {
         "RAY_AUTH_MODE": "token",
         "RAY_AUTH_TOKEN": token,
-        "PYTHONPATH": os.pathsep.join(str(path) for path in Path(__file__).parents[:2]),
+        "PYTHONPATH": os.pathsep.join(str(path) for path in Path(__file__).parents[2:4]),
         _MARK: mark,
         # Losses are found in seconds, not in minutes.
         "RAY_health_check_initial_delay_ms": "0",

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sheet_sequence import FRAMES, NODE, write_sheet
 
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.synthetic.code_version import generator_version
 from physhandi.synthetic.suite.evaluation import Order
+from support.inputs.sheet_sequence import FRAMES, NODE, write_sheet
 
 SETTINGS = {
     "object_.search.generations": 1,

@@ -11,7 +11,6 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from waiting import LIMIT_S, until
 
 from app.graceful_server import GracefulServer
 from app.jobs.catalog import Catalog
@@ -22,6 +21,7 @@ from app.server import create_app
 from app.settings import ServerSettings
 from app.viewer.sessions import TooManySessionsError
 from physhandi.data.run_folder import read_events
+from support.waiting import LIMIT_S, until
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 
@@ -114,7 +114,7 @@ def queue_world(data_dir: Path, bundled: Path) -> Iterator[QueueWorld]:
     """Serve a data folder; when it is over, no process of a run is left."""
     settings = ServerSettings(data_dir=data_dir, cancel_grace_s=1.0)
     catalog = Catalog(settings, bundled=bundled)
-    scheduler = Scheduler(settings, catalog, worker="job_worker")
+    scheduler = Scheduler(settings, catalog, worker="support.server.job_worker")
     security = Security(settings)
     scenes: Any = Scenes()
     app = create_app(

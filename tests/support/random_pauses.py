@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-_APPLICATION = str(Path(__file__).resolve().parents[1] / "app")
+_APPLICATION = str(Path(__file__).resolve().parents[2] / "app")
 _BENCHMARKS = f"{_APPLICATION}/benchmarks"
 
 

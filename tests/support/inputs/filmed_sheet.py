@@ -4,13 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from sheet_sequence import FACES, FRAMES, NODE, write_sheet
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.rendering.renderer import rasterize
 from physhandi.rendering.shapes import Surface
+from support.inputs.sheet_sequence import FACES, FRAMES, NODE, write_sheet
 
 WIDTH, HEIGHT = 96, 72
 EYES = {"front": (0.1, -0.6, 0.85), "side": (0.7, 0.1, 0.9), "back": (0.1, 0.75, 0.8)}

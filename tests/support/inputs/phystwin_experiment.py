@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from phystwin_case import Case, save_pickle
 from reference.spring_mass import Scene, simulate
+
+from support.inputs.phystwin_case import Case, save_pickle
 
 OPTIMUM: dict[str, Any] = {
     "global_spring_Y": np.float32(9000.0),

@@ -7,7 +7,6 @@ from typing import Any
 
 from fastapi import FastAPI
 from pydantic import SecretStr
-from sheet_sequence import sheet_config
 from starlette.testclient import TestClient
 
 from app.jobs.catalog import Catalog
@@ -19,6 +18,7 @@ from app.viewer.sessions import Sessions
 from physhandi import pipeline
 from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
+from support.inputs.sheet_sequence import sheet_config
 
 TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
 HOST = "127.0.0.1:8080"
@@ -68,7 +68,7 @@ def make_world(data_dir: Path, *, bundled: Path = BUNDLED, **changes: Any) -> Wo
     )
     security = Security(settings)
     catalog = Catalog(settings, bundled=bundled)
-    scheduler = Scheduler(settings, catalog, worker="job_worker")
+    scheduler = Scheduler(settings, catalog, worker="support.server.job_worker")
     sessions = Sessions(settings, catalog)
     return World(settings, security, catalog, scheduler, sessions)
 

@@ -12,9 +12,9 @@ from typing import Any
 from unittest.mock import patch
 
 import psutil
-from waiting import LIMIT_S, until
 
 from app.jobs.engines import cluster as cluster_module
+from support.waiting import LIMIT_S, until
 
 TOKEN = 4 * "the cluster's"
 

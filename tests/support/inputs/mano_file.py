@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 import torch
-from foreign_pickle import chumpy_array, chumpy_select, python2_pickle
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from physhandi.hand.open_hand import OpenHand
+from support.hostile.foreign_pickle import chumpy_array, chumpy_select, python2_pickle
 
 VERTICES, FACES = 778, 1538
 TIPS = {744: 0, 320: 1, 443: 2, 554: 3, 671: 4}

@@ -7,10 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from raw_capture import picture
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.camera import PinholeCamera
+from support.inputs.raw_capture import picture
 
 TREE = "tf2_msgs/msg/TFMessage"
 BEGIN = 1_700_000_000_000_000_000

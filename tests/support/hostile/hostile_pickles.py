@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from foreign_pickle import Call, Global, New, python2_pickle
+
+from support.hostile.foreign_pickle import Call, Global, New, python2_pickle
 
 
 class Hostile:

@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from phystwin_case import edit_json, edit_pickle, save_pickle
 
 from physhandi.data.importers import phystwin_files
 from physhandi.data.importers.phystwin import import_phystwin
 from physhandi.errors import ImportFailedError
+from support.inputs.phystwin_case import edit_json, edit_pickle, save_pickle
 
 Damage = Callable[[Path], Any]
 """Changes the folder of a case."""

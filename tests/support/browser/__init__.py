@@ -1,0 +1,1 @@
+"""Pages in a browser: scenes, accessibility, pictures small enough to be made fast."""

@@ -1,0 +1,1 @@
+"""Files, programs and folders that are damaged, unfinished or mean harm."""

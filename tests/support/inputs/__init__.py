@@ -1,0 +1,1 @@
+"""Recordings, networks and meshes that tests make or read."""

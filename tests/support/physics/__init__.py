@@ -1,0 +1,1 @@
+"""Bodies, hands and pictures whose motion or shape is known in closed form."""

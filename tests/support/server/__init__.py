@@ -1,0 +1,1 @@
+"""Servers, queues and workers, whole or with made-up fits."""

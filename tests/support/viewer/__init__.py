@@ -1,0 +1,1 @@
+"""Live scenes without a browser: sessions, their clients and what files show."""
