@@ -15,6 +15,8 @@ PICTURE_WIDTH = 1_600
 """Width of an exported picture of both sides [px]."""
 _PANEL_PIXELS = 345
 _FOV = float(np.deg2rad(14.0))
+_SAME_FOV = 1e-3
+"""Fields of view that differ by less are the same [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,12 +53,22 @@ Box = tuple[Float[ndarray, " 3"], float, float]
 """Middle, width and height of something as it is seen."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Aim:
+    """Where a camera was told to stand."""
+
+    position: Float[ndarray, " 3"]
+    look_at: Float[ndarray, " 3"]
+    size: tuple[int, int]
+    """Width and height of the client's picture at that time [px]."""
+
+
 class ComparisonCameras:
     """Moves the cameras of the clients to both sides and back."""
 
     def __init__(self) -> None:
         self._poses: dict[int, Pose] = {}
-        self._aims: dict[int, tuple[Float[ndarray, " 3"], tuple[int, int]]] = {}
+        self._aims: dict[int, _Aim] = {}
 
     def aim(
         self,
@@ -83,7 +95,8 @@ class ComparisonCameras:
         distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
         aside = 0.5 * hidden * (2 * slope * distance / height) * eye.right
         place = center + aside - distance * eye.ahead
-        self._aims[client.client_id] = place, (camera.image_width, camera.image_height)
+        size = camera.image_width, camera.image_height
+        self._aims[client.client_id] = _Aim(position=place, look_at=center + aside, size=size)
         with client.atomic():
             camera.up_direction, camera.fov = pose.up, _FOV
             camera.position, camera.look_at = place, center + aside
@@ -91,18 +104,25 @@ class ComparisonCameras:
     def has_lost(self, client: viser.ClientHandle) -> bool:
         """Tell whether a camera that was aimed no longer shows both sides, and no user did that.
 
-        A browser may hear where its first camera stands after it was told to look at both sides;
-        and the window may have got another size.
+        A browser may hear of its first camera after it was told to look at both sides, of all of it
+        or of its place, direction or lens alone; and the window may have got another size.
         """
         aim, before = self._aims.get(client.client_id), self._poses.get(client.client_id)
         if aim is None or before is None:
             return False
-        camera, (place, size) = client.camera, aim
-        near = 1e-3 * float(np.linalg.norm(place - camera.look_at))
-        if np.linalg.norm(camera.position - place) < near:
-            return (camera.image_width, camera.image_height) != size
-        gaps = camera.position - before.position, camera.look_at - before.look_at
-        return all(float(np.linalg.norm(gap)) < near for gap in gaps)
+        camera = client.camera
+        near = 1e-3 * float(np.linalg.norm(aim.position - aim.look_at))
+
+        def is_at(position: Float[ndarray, " 3"], place: Float[ndarray, " 3"]) -> bool:
+            return float(np.linalg.norm(position - place)) < near
+
+        stands, looks = is_at(camera.position, aim.position), is_at(camera.look_at, aim.look_at)
+        if stands and looks:
+            size = camera.image_width, camera.image_height
+            return size != aim.size or abs(camera.fov - _FOV) > _SAME_FOV
+        stood = is_at(camera.position, before.position)
+        looked = is_at(camera.look_at, before.look_at)
+        return (stands or stood) and (looks or looked)
 
     def before(self, client: viser.ClientHandle) -> Pose:
         """Find where a camera stands, or stood before it was moved to both sides."""

@@ -457,6 +457,19 @@ def test_a_camera_that_was_not_moved_by_a_user_keeps_both_sides_in_its_picture(
         )
         client.until(lambda: np.allclose(client.camera["position"], aimed, atol=1e-6))
         client.until(lambda: is_aimed(client))
+        # Or of a part of it: both sides would be too small, or out of the picture.
+        target, lens = np.array(client.camera["look_at"]), client.camera["fov"]
+        for part in (
+            {"fov": 0.8},
+            {"look_at": first.look_at.tolist()},
+            {"position": first.position.tolist()},
+        ):
+            (name,) = part
+            client.tell_camera(**part)
+            client.until(lambda name=name, part=part: client.camera[name] != part[name])
+            client.until(lambda: np.allclose(client.camera["position"], aimed, atol=1e-6))
+            client.until(lambda: np.allclose(client.camera["look_at"], target, atol=1e-6))
+            assert client.camera["fov"] == lens
         # A window that is narrower needs a camera that is farther away.
         client.tell_camera(image_width=320)
         client.until(lambda: not np.allclose(client.camera["position"], aimed, atol=0.01))
