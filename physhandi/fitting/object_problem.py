@@ -24,7 +24,7 @@ from physhandi.simulation.contact_intervals import ContactIntervals
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.stability import bound_substeps, stable_substeps
+from physhandi.simulation.stability import stable_substeps
 from physhandi.simulation.topology import build_model
 
 TRACK_CARRIERS = 4
@@ -477,16 +477,18 @@ def settle_substeps(
     config: ObjectFitConfig,
     *,
     safety: float = SUBSTEP_SAFETY,
-    is_quick: bool = False,
 ) -> SimulationParameters:
     """Choose substeps that keep all models stable, if the configuration sets them automatically.
 
     Near the limit a simulation may stay bounded and still be noise: without the margin a search
-    finds parameters whose gradients are useless. Quickly chosen ones are no fewer, at a tenth of
-    the cost.
+    finds parameters whose gradients are useless.
     """
     if not config.automatic_substeps:
         return parameters
-    measure = bound_substeps if is_quick else stable_substeps
-    needed = max(measure(model, parameters, safety=safety) for model in models)
+    needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
+    return with_substeps(parameters, needed)
+
+
+def with_substeps(parameters: SimulationParameters, needed: int) -> SimulationParameters:
+    """Give parameters the least round number of substeps that is not below what is needed."""
     return parameters.replace(substeps_per_frame=10 * math.ceil(needed / 10))

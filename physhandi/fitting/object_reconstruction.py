@@ -22,12 +22,14 @@ from physhandi.data.checkpoint import Checkpointer, SavedState, resumed_note
 from physhandi.errors import FitError, SimulationDivergedError, UsageError
 from physhandi.fitting.config import ObjectFitConfig, SearchConfig
 from physhandi.fitting.object_problem import (
+    SUBSTEP_SAFETY,
     ObjectProblem,
     build_problem_model,
     mean_loss,
     problem_parameters,
     settle_substeps,
     simulate_problem,
+    with_substeps,
 )
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_parameters
@@ -40,6 +42,7 @@ from physhandi.simulation.engines.batch import (
     losses_at_once,
     shared_out,
 )
+from physhandi.simulation.engines.batch_substeps import bound_substeps
 from physhandi.simulation.engines.cpu import processor_count
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import SpringMassModel
@@ -333,6 +336,7 @@ class CandidateEvaluator:
         self._preview = RolloutPreview(SEARCH_STAGE, progress)
         self._best_loss = np.inf
         self._best: SimulationParameters | None = None
+        self._has_kernels = False
         self._known_losses = known_losses or _KnownLosses(Checkpointer())
 
     def __call__(
@@ -378,14 +382,13 @@ class CandidateEvaluator:
             for problem in self._problems
         ]
         is_batched = wp.get_device(self._device).is_cuda
-        settled: list[SimulationParameters] = []
-        possible: list[int] = []
-        for index, parameters in enumerate(candidates):
-            models = [master.model(parameters) for master in masters]
-            chosen = settle_substeps(models, parameters, self._config, is_quick=is_batched)
-            settled.append(chosen)
-            if self._is_possible(models, settled[-1]):
-                possible.append(index)
+        settled = (self._settle_batch if is_batched else self._settle)(masters, candidates)
+        possible = [
+            index
+            for index, parameters in enumerate(settled)
+            if parameters.substeps_per_frame <= self._config.most_substeps
+            and all(master.has(parameters).any() for master in masters)
+        ]
         if is_batched:
             # A batch takes the substeps of the candidate that needs most. The best one keeps them:
             # with longer ones it would move otherwise than it was judged, and may diverge.
@@ -403,6 +406,30 @@ class CandidateEvaluator:
             mean[winner] = np.inf
             winner = int(np.argmin(mean))
         return settled, mean
+
+    def _settle(
+        self, masters: Many[MasterTopology], candidates: Many[SimulationParameters]
+    ) -> list[SimulationParameters]:
+        """Give each candidate the substeps that it needs."""
+        return [
+            settle_substeps([master.model(each) for master in masters], each, self._config)
+            for each in candidates
+        ]
+
+    def _settle_batch(
+        self, masters: Many[MasterTopology], candidates: Many[SimulationParameters]
+    ) -> list[SimulationParameters]:
+        """Give each candidate substeps that are enough, without building its model."""
+        if not self._config.automatic_substeps:
+            return list(candidates)
+        needed = [
+            bound_substeps(master, candidates, self._device, safety=SUBSTEP_SAFETY)
+            for master in masters
+        ]
+        return [
+            with_substeps(parameters, max(of_masters))
+            for parameters, *of_masters in zip(candidates, *needed, strict=True)
+        ]
 
     def _holds_alone(self, masters: Many[MasterTopology], parameters: SimulationParameters) -> bool:
         """Tell whether a candidate does not diverge when it is simulated alone.
@@ -428,10 +455,6 @@ class CandidateEvaluator:
             self._best_loss,
             lambda: simulate_problem(problem, model, parameters, self._device)[0],
         )
-
-    def _is_possible(self, models: Many[SpringMassModel], parameters: SimulationParameters) -> bool:
-        has_springs = all(len(model.spring_nodes) > 0 for model in models)
-        return has_springs and parameters.substeps_per_frame <= self._config.most_substeps
 
     def _simulate(
         self,
@@ -488,7 +511,13 @@ class CandidateEvaluator:
         if len(batch) == 1 or self._threads == 1:
             for index in batch:
                 simulate(index)
+            self._has_kernels = True
             return
+        if not self._has_kernels:
+            # Warp 1.19 crashes where two threads load the same kernels at once.
+            simulate(batch[0], 1)
+            batch = batch[1:]
+            self._has_kernels = True
         with ThreadPoolExecutor(self._threads, thread_name_prefix="physhandi-candidate") as pool:
             jobs = [pool.submit(simulate, index, 1) for index in batch]
             try:

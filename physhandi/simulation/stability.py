@@ -52,13 +52,13 @@ def largest_stable_step(
         The step; infinity if nothing is stiff or damped.
     """
     springs = _SpringOperator.of(model, parameters, control)
-    step = _critical_step(springs.highest_load("stiffness"), springs.highest_load("damping"))
+    step = critical_step(springs.highest_load("stiffness"), springs.highest_load("damping"))
     if math.isinf(step):
         return step
     mode = np.random.default_rng(0).standard_normal(3 * model.node_count)
     for _ in range(_MOST_ROUNDS):
         mode = _stiffest_mode(springs, step, mode)
-        previous, step = step, _critical_step(*springs.of_mode(mode))
+        previous, step = step, critical_step(*springs.of_mode(mode))
         if abs(step - previous) <= _STEP_TOLERANCE * step:
             break
     return step
@@ -81,51 +81,6 @@ def stable_substeps(
     """
     step = largest_stable_step(model, parameters, control)
     return max(1, math.ceil(safety / (parameters.simulated_frame_rate * step)))
-
-
-def bound_substeps(
-    model: SpringMassModel, parameters: SimulationParameters, *, safety: float = SAFETY
-) -> int:
-    """Return a number of substeps that `stable_substeps` does not exceed, at a tenth of its cost.
-
-    A spring between nodes that move by x and y stores at most twice what it would store if each of
-    them moved alone. So no mode is stiffer than twice the stiffest direction of a node whose
-    neighbors stand still.
-    """
-    own, count = model.object_spring_count, model.node_count
-    ends, virtual = model.spring_nodes[:own], model.spring_nodes[own:]
-    direction = _unit(np.diff(model.object_node.astype(np.float64)[ends], axis=1)[:, 0])
-    x, y, z = direction.T
-    products = (x * x, y * y, z * z, x * y, y * z, z * x)
-    rates = (
-        parameters.stiffness_scale * model.stiffness.astype(np.float64) / model.rest_length,
-        model.damping.astype(np.float64),
-    )
-    loads = []
-    for rate in rates:
-        block = np.zeros((6, count))
-        for place, product in enumerate(products):
-            weight = product * rate[:own]
-            block[place] = np.bincount(ends[:, 0], weight, minlength=count)
-            block[place] += np.bincount(ends[:, 1], weight, minlength=count)
-        anchor = np.bincount(virtual.min(axis=1, initial=count), rate[own:], minlength=count)
-        loads.append(float((2.0 * _largest_eigenvalue(block) + anchor[:count]).max(initial=0.0)))
-    step = _critical_step(*loads)
-    return max(1, math.ceil(safety / (parameters.simulated_frame_rate * step)))
-
-
-def _largest_eigenvalue(block: Float[ndarray, "6 matrix"]) -> Float[ndarray, " matrix"]:
-    """Compute the largest eigenvalue of symmetric matrices xx, yy, zz, xy, yz, zx, in closed form.
-
-    Smith, Eigenvalues of a symmetric 3 x 3 matrix, Communications of the ACM 4, 1961.
-    """
-    xx, yy, zz, xy, yz, zx = block
-    mean = (xx + yy + zz) / 3.0
-    xx, yy, zz = xx - mean, yy - mean, zz - mean
-    spread = np.sqrt((xx**2 + yy**2 + zz**2 + 2.0 * (xy**2 + yz**2 + zx**2)) / 6.0)
-    determinant = xx * (yy * zz - yz**2) - xy * (xy * zz - yz * zx) + zx * (xy * yz - yy * zx)
-    half = determinant / np.maximum(2.0 * spread**3, np.finfo(np.float64).tiny)
-    return mean + 2.0 * spread * np.cos(np.arccos(np.clip(half, -1.0, 1.0)) / 3.0)
 
 
 def with_stable_substeps(
@@ -185,8 +140,13 @@ def explain_divergence(model: SpringMassModel, parameters: SimulationParameters,
     )
 
 
-def _critical_step(stiffness: float, damping: float) -> float:
-    """Return the dt with dt² k + 2 dt c = 4."""
+def critical_step(stiffness: float, damping: float) -> float:
+    """Return the longest stable substep of a mode of unit mass, the dt with dt² k + 2 dt c = 4 [s].
+
+    Args:
+        stiffness: The k [N/m].
+        damping: The c [N·s/m].
+    """
     if stiffness <= 0.0 and damping <= 0.0:
         return math.inf
     return 4.0 / (damping + math.sqrt(damping * damping + 4.0 * stiffness))

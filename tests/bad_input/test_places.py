@@ -219,6 +219,8 @@ def test_an_interrupted_fit_with_a_torn_list_of_stages_begins_anew(
 def in_a_process(folder: Path, *order: str, setup: str = "") -> tuple[int, str]:
     """Give an order as a shell does; returns exit code and standard error."""
     code = f"{setup}\nfrom app.cli import main; main()"
+    # Counting lines would need a file, too, which some of these processes cannot write.
+    inherited = {name: os.environ[name] for name in os.environ.keys() - {"COVERAGE_PROCESS_CONFIG"}}
     done = subprocess.run(
         [sys.executable, "-c", code, *order],
         cwd=folder,
@@ -226,7 +228,7 @@ def in_a_process(folder: Path, *order: str, setup: str = "") -> tuple[int, str]:
         text=True,
         timeout=LIMIT_S,
         check=False,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=inherited | {"PYTHONPATH": str(ROOT)},
     )
     return done.returncode, done.stderr
 

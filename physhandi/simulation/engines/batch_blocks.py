@@ -156,8 +156,11 @@ def _cut_group(
     """Cut one group; the arrays are those of `GroupBlocks`, as if it were the only one."""
     count = len(node)
     spring = np.flatnonzero(exists.any(axis=0))
-    source, other = np.concatenate([spring_nodes[spring], spring_nodes[spring, ::-1]]).T
-    lacking = (~exists[:, spring]).astype(np.int64).T @ (1 << np.arange(len(exists)))
+    one, another = spring_nodes[spring].astype(np.int64).T
+    source, other = np.concatenate([one, another]), np.concatenate([another, one])
+    lacking = np.zeros(len(spring), dtype=np.int64)
+    for candidate, has_spring in enumerate(exists):
+        lacking |= ~has_spring[spring] * np.int64(1 << candidate)
     spring, lacking = np.tile(spring, 2), np.tile(lacking, 2)
     certain = lacking == 0
     degree = np.bincount(source, minlength=count)
@@ -174,13 +177,15 @@ def _cut_group(
     local = np.empty(count, dtype=np.int64)
     local[order] = np.arange(count) - own_start[block[order]]
 
-    halo, pair = np.unique(block[source[crosses]] * count + other[crosses], return_inverse=True)
-    halo_block, halo_node = np.divmod(halo, count)
-    halo_count = np.bincount(halo_block, minlength=blocks)
+    beyond, needed = block[source[crosses]], other[crosses]
+    is_halo = np.zeros((blocks, count), dtype=bool)
+    is_halo[beyond, needed] = True
+    halo_node = np.nonzero(is_halo)[1]
+    halo_count = is_halo.sum(axis=1)
     halo_start = np.concatenate([[0], np.cumsum(halo_count)])
+    halo_local = own_count[:, None] + np.cumsum(is_halo, axis=1) - 1
     other_local = local[other]
-    beyond = block[source[crosses]]
-    other_local[crosses] = own_count[beyond] + pair.reshape(-1) - halo_start[beyond]
+    other_local[crosses] = halo_local[beyond, needed]
     parts = zip(
         np.split(order, own_start[1:-1]), np.split(halo_node, halo_start[1:-1]), strict=True
     )
@@ -193,7 +198,8 @@ def _cut_group(
     row_block = np.repeat(np.arange(blocks), TILE * np.diff(tile_start))
     row_local = np.minimum(np.arange(rows) - TILE * tile_start[row_block], own_count[row_block] - 1)
     bin_of = (2 * row[source] + ~certain) * PHASE + other_local % PHASE
-    by_bin = np.argsort(bin_of, kind="stable")
+    # Sorting numbers that are followed by their places takes a quarter of sorting places.
+    by_bin = np.sort(bin_of * len(bin_of) + np.arange(len(bin_of))) % len(bin_of)
     return {
         "own_count": own_count,
         "border_count": np.bincount(block[~is_inner], minlength=blocks),

@@ -348,7 +348,7 @@ def test_the_process_dies_with_its_parent() -> None:
     script = (
         "import os\n"
         "from app.viewer.live.client import SimulationClient\n"
-        "from waiting import until\n"
+        "from support.waiting import until\n"
         "live = SimulationClient()\n"
         "live.subscribe('a', lambda message: None)\n"
         "until(lambda: live.process_id)\n"

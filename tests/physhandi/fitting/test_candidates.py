@@ -23,6 +23,7 @@ from physhandi.fitting.object_problem import (
 from physhandi.fitting.object_reconstruction import CandidateEvaluator
 from physhandi.progress import NullProgress, Preview, Progress
 from physhandi.simulation.engines.batch import BatchSimulator, shared_out
+from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
 
 PARAMETERS = SimulationParameters(
@@ -244,9 +245,29 @@ def test_candidates_are_simulated_at_once_with_the_same_bits(
         pairs.wait()
         return losses(simulator, *arguments)
 
-    monkeypatch.setattr(BatchSimulator, "losses", met)
     evaluate = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), threads=2)
+    assert evaluate(candidates[:1]) == alone[:1]
+    monkeypatch.setattr(BatchSimulator, "losses", met)
     assert evaluate(candidates) == alone
+
+
+def test_the_first_candidate_loads_the_kernels_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a stopped search goes on, its first candidates come several at once."""
+    events: list[str] = []
+    losses = BatchSimulator.losses
+
+    def noted(simulator: BatchSimulator, *arguments: Any) -> Any:
+        events.append("begins")
+        result = losses(simulator, *arguments)
+        events.append("ends")
+        return result
+
+    monkeypatch.setattr(BatchSimulator, "losses", noted)
+    evaluate = CandidateEvaluator([sheet("a", 0.2)], ObjectFitConfig(), NullProgress(), threads=2)
+    judged = evaluate(drawn(5))
+    assert all(np.isfinite(loss) for _, loss in judged)
+    assert events[:2] == ["begins", "ends"]
+    assert events.count("ends") == 5
 
 
 def test_a_candidate_that_fails_in_its_thread_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,3 +300,26 @@ def test_the_best_of_a_batch_must_hold_alone_too(monkeypatch: pytest.MonkeyPatch
     judged = [loss for _, loss in evaluate(candidates)]
     losses[best] = math.inf
     assert judged == losses
+
+
+def test_a_batch_gets_substeps_that_are_enough_for_each_of_its_sequences() -> None:
+    problems = [sheet("flat", 0.05), sheet("stiff", 0.2, rest_node=0.5 * NODE)]
+    candidates = [p.replace(stiffness=100.0 * p.stiffness) for p in drawn(4)]
+    config = ObjectFitConfig(automatic_substeps=True)
+    evaluate = CandidateEvaluator(problems, config, NullProgress())
+    masters = [
+        MasterTopology.of(p.object_node, p.control[0], candidates, rest_node=p.rest_node)
+        for p in problems
+    ]
+    exact, bound = (
+        [p.substeps_per_frame for p in settle(masters, candidates)]
+        for settle in (evaluate._settle, evaluate._settle_batch)
+    )
+    alone = [
+        [p.substeps_per_frame for p in evaluate._settle_batch([m], candidates)] for m in masters
+    ]
+    assert bound == [max(both) for both in zip(*alone, strict=True)]
+    assert alone[1] > alone[0] > [0] * 4  # Springs half as long are twice as stiff, and more.
+    assert all(more >= least and more % 10 == 0 for more, least in zip(bound, exact, strict=True))
+    fixed = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress())
+    assert fixed._settle_batch(masters, candidates) == candidates
