@@ -202,7 +202,7 @@ class Session(SceneServer):
 
     def close(self) -> None:
         """Stop clock, simulation and server."""
-        self._is_closed = True
+        self._begin_to_close()
         self._gone.set()
         self._playback.close()
         if self._steer is not None:

@@ -131,7 +131,7 @@ class CompareSession(SceneServer):
 
     def close(self) -> None:
         """Stop clock, measuring and server."""
-        self._is_closed = True
+        self._begin_to_close()
         self._playback.close()
         self._view.curve.close()
         self._server.stop()

@@ -86,6 +86,7 @@ class SceneServer(ABC):
         self.created = time.time()
         self._seen = time.monotonic()
         self._is_closed = False
+        self._closing = threading.Lock()
         self._lock = threading.RLock()
         self._server = start_viser(without_markup(title))
         self._guard = Guard(self._server)
@@ -146,5 +147,11 @@ class SceneServer(ABC):
         """Keep the camera of a client that leaves, for the tab that is being reloaded."""
         self._seen = time.monotonic()
         pose = self._forget(client)
-        if not self._is_closed:
-            pose.give_first(self._server.initial_camera)
+        with self._closing:
+            if not self._is_closed:
+                pose.give_first(self._server.initial_camera)
+
+    def _begin_to_close(self) -> None:
+        """Keep no camera from now on: the server is about to stop."""
+        with self._closing:
+            self._is_closed = True

@@ -20,6 +20,7 @@ from support.waiting import WatchedLock, until
 
 from app.viewer.compare.camera import Eye
 from app.viewer.content.content import Content
+from app.viewer.content.session_state import Pose
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
 from app.viewer.physics.history import TriedSetting
@@ -262,6 +263,26 @@ def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
             comparison._leave()
         late.join(PATIENCE)
         assert aimed == []
+
+
+def test_a_camera_that_leaves_is_kept_before_its_scene_closes_or_not_at_all(
+    sessions: Sessions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with watched(sessions) as (session, _):
+        (viewer,) = session._server.get_clients().values()
+        kept: list[object] = []
+        monkeypatch.setattr(Pose, "give_first", lambda _, camera: kept.append(camera))
+        monkeypatch.setattr(session, "_closing", WatchedLock())
+        session._part(viewer)
+        assert kept == [session._server.initial_camera]
+        with session._closing:
+            closing = beside(session.close)
+            until_it_waits(closing, session._closing)
+            assert not session._is_closed
+        closing.join(PATIENCE)
+        session._part(viewer)
+        assert session._is_closed
+        assert len(kept) == 1
 
 
 def test_a_camera_that_is_heard_late_brings_no_comparison_back(sessions: Sessions) -> None:
