@@ -1,4 +1,4 @@
-"""Rotations: the smallest between vectors, the best between points, axes carried without twist."""
+"""Rotations: the smallest between vectors, the best between points, without twist or jumps."""
 
 import math
 
@@ -118,6 +118,13 @@ def best_rotations(
     if not is_sure.all():
         turned[~is_sure] = _decomposed(every[~is_sure], thin)
     return turned.reshape(moment.shape)
+
+
+def without_jumps(rotation: Float[ndarray, "frame *batch 4"]) -> Float[ndarray, "frame *batch 4"]:
+    """Choose of q and -q, which are the same rotation, the one nearer to the frame before."""
+    flips = np.where((rotation[1:] * rotation[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
+    sign = np.concatenate([np.ones_like(flips[:1]), np.cumprod(flips, axis=0)])
+    return rotation * sign[: len(rotation), ..., None]
 
 
 def _cofactors(m: Float[ndarray, "9 item"]) -> Float[ndarray, "9 item"]:

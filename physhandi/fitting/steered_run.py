@@ -31,7 +31,7 @@ from physhandi.hand.curl import (
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import Progress
-from physhandi.quaternions import without_jumps
+from physhandi.rotations import without_jumps
 from physhandi.simulation.contact_intervals import ContactIntervals, acts_in, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.steering import SteeredHand, turn_on

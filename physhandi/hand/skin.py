@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from physhandi.hand.model import JOINT_COUNT, HandModel
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.names import JOINT_NAMES
-from physhandi.quaternions import without_jumps
+from physhandi.rotations import without_jumps
 
 BONES_PER_VERTEX = 4
 """Most bones of one vertex; viewers read no more."""

@@ -79,7 +79,17 @@ def stable_substeps(
         control: Where the control nodes are at frame 0 [m]; see `largest_stable_step`.
         safety: Factor on the number of substeps that is just stable.
     """
-    step = largest_stable_step(model, parameters, control)
+    return substeps_of(largest_stable_step(model, parameters, control), parameters, safety)
+
+
+def substeps_of(step: float, parameters: SimulationParameters, safety: float) -> int:
+    """Return how many substeps a frame needs, of which none is longer than the longest stable one.
+
+    Args:
+        step: Longest stable substep [s].
+        parameters: For `simulated_frame_rate`.
+        safety: Factor on the number of substeps that is just stable.
+    """
     return max(1, math.ceil(safety / (parameters.simulated_frame_rate * step)))
 
 
@@ -176,7 +186,7 @@ class _SpringOperator:
         node = model.object_node.astype(np.float64)
         ends, virtual = model.spring_nodes[:own], model.spring_nodes[own:]
         held_node = virtual.min(axis=1, initial=count)
-        direction = _unit(node[ends[:, 1]] - node[ends[:, 0]])
+        direction = unit(node[ends[:, 1]] - node[ends[:, 0]])
         value = np.concatenate([-direction, direction], axis=1).ravel()
         column = _coordinates(ends)
         row_end = 6 * np.arange(own + 1)
@@ -188,7 +198,7 @@ class _SpringOperator:
             rate = {name: value[:own] for name, value in rate.items()}
         else:
             place = np.asarray(control, dtype=np.float64)[virtual.max(axis=1, initial=0) - count]
-            value = np.concatenate([value, _unit(node[held_node] - place).ravel()])
+            value = np.concatenate([value, unit(node[held_node] - place).ravel()])
             column = np.concatenate([column, _coordinates(held_node)])
             row_end = np.concatenate([row_end, row_end[-1] + 3 * np.arange(1, len(held_node) + 1)])
             # Where a spring that is attached later points then is not known.
@@ -287,5 +297,6 @@ def _coordinates(node: ndarray) -> ndarray:
     return (3 * node[..., None] + np.arange(3)).ravel()
 
 
-def _unit(offset: ndarray) -> ndarray:
+def unit(offset: Float[ndarray, "spring 3"]) -> Float[ndarray, "spring 3"]:
+    """Return directions; zero of springs without a length."""
     return offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)

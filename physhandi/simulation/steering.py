@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from physhandi.errors import UsageError
-from physhandi.quaternions import without_jumps
+from physhandi.rotations import without_jumps
 from physhandi.simulation.contact_intervals import always
 from physhandi.simulation.fingers import BENDS, CURLS, Fingers, curled
 from physhandi.simulation.forces import virtual_spring_forces

@@ -14,7 +14,7 @@ INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.
 """Code that makes the inputs of methods."""
 PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
-    *("rotations.py", "quaternions.py", "adam.py", "one_thread.py", "typed.py"),
+    *("rotations.py", "adam.py", "one_thread.py", "typed.py"),
     *("unique_rows.py", "data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     "metrics/truth_metrics.py",
@@ -29,7 +29,7 @@ LOOKS = (
 )
 """Code that fits what an object looks like, and draws it."""
 SCORES = (
-    *("metrics", "synthetic/suite/cells.py", "hand", "quaternions.py"),
+    *("metrics", "synthetic/suite/cells.py", "hand"),
     *LOOKS,
 )
 """Code that scores predictions."""

@@ -13,8 +13,8 @@ import physhandi.appearance.kernels
 import physhandi.rendering.kernels
 import physhandi.simulation.kernels
 from physhandi.devices import start_warp
-from physhandi.simulation.kernels.batch import make_batch_kernel
-from physhandi.simulation.kernels.batch_frame import make_batch_frame_kernel
+from physhandi.simulation.kernels.batch.frame import make_batch_frame_kernel
+from physhandi.simulation.kernels.batch.substep import make_batch_kernel
 from physhandi.simulation.kernels.cuda_adjoint import make_adjoint_kernel
 from physhandi.simulation.kernels.cuda_frame import make_frame_kernel
 from physhandi.simulation.kernels.cuda_large_frame import make_large_frame_kernel

@@ -15,7 +15,7 @@ from numpy import ndarray
 from scipy.linalg import solveh_banded
 from torch import Tensor
 
-from physhandi.quaternions import without_jumps
+from physhandi.rotations import without_jumps
 
 FREEDOM = 26
 """Numbers by which a real hand is posed in a frame: 20 angles of fingers, 6 of the wrist."""

@@ -13,7 +13,7 @@ device)             in `kernels.adjoint`           the reference, and the way of
 `cuda`              `kernels.cuda_frame.pull`,     A frame is one launch whose threads keep their
                     `kernels.cuda_adjoint`         springs in registers; no launch between substeps.
 `side_by_side`      those of `cuda`                Tens of candidates: bodies of one launch a frame.
-`batch`             `kernels.batch`                Many candidates: a thread works on one node of
+`batch`             `kernels.batch.substep`        Many candidates: a thread works on one node of
                                                    several, whose numbers lie side by side.
 ==================  =============================  ================================================
 

@@ -23,7 +23,17 @@ from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
 from physhandi.simulation.engines.side_by_side import FEW_OWN, SideBySide
-from physhandi.simulation.kernels.batch import (
+from physhandi.simulation.kernels.batch.frame import GROUP_WIDTH
+from physhandi.simulation.kernels.batch.losses import (
+    NODES,
+    POINTS_PER_THREAD,
+    add_losses,
+    find_nearest,
+    sum_accelerations,
+    sum_chamfer,
+    sum_tracks,
+)
+from physhandi.simulation.kernels.batch.substep import (
     BLOCK_NODES,
     CANDIDATE_FIELDS,
     NO_GROUND,
@@ -32,16 +42,6 @@ from physhandi.simulation.kernels.batch import (
     note_divergence,
     place_batch,
     take_batch,
-)
-from physhandi.simulation.kernels.batch_frame import GROUP_WIDTH
-from physhandi.simulation.kernels.batch_losses import (
-    NODES,
-    POINTS_PER_THREAD,
-    add_losses,
-    find_nearest,
-    sum_accelerations,
-    sum_chamfer,
-    sum_tracks,
 )
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import checked_control
@@ -111,7 +111,7 @@ class LossSum:
             target: Observations.
             node_number: Index in the states of each of the model's nodes.
             lanes: Candidates in the states, padding included.
-            width: Candidates of a group; see `kernels.batch`.
+            width: Candidates of a group; see `kernels.batch.substep`.
             device: Warp device.
         """
         self._device, self._lanes = device, lanes

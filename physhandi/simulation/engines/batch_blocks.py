@@ -1,7 +1,7 @@
 """Cuts groups of candidates of a large object into blocks that one launch moves by a frame.
 
 `GroupBlocks` says which nodes and half-edges each block has, `BatchBlocks` holds them on the device
-for `kernels.batch_frame`.
+for `kernels.batch.frame`.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from physhandi.simulation.engines.cuda import BYTES_OF_A_THREAD, LEAST_OWN, Relay
 from physhandi.simulation.engines.partition import bisect_nodes
-from physhandi.simulation.kernels.batch_frame import (
+from physhandi.simulation.kernels.batch.frame import (
     BYTES_OF_A_BLOCK,
     BYTES_OF_A_LOCAL,
     BYTES_OF_AN_ENTRY,

@@ -1,16 +1,15 @@
 """Substeps with which each candidate of a search is stable, all found in one launch."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 from numpy import ndarray
 
-from physhandi.simulation.kernels.substeps import find_loads
+from physhandi.simulation.kernels.batch.loads import find_loads
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.stability import SAFETY, critical_step
+from physhandi.simulation.stability import SAFETY, critical_step, substeps_of, unit
 from physhandi.simulation.topology import virtual_floor
 
 
@@ -44,7 +43,6 @@ def bound_substeps(
     order = np.argsort(node, kind="stable")
     start = np.searchsorted(node[order], np.arange(nodes + 1))
     offset = np.diff(master.object_node.astype(np.float64)[ends[:own]], axis=1)[:, 0]
-    direction = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-300)[:, None]
     limits = np.array([_limits(parameters) for parameters in candidates])
 
     def array(value: ndarray, kind: type, dtype: type) -> wp.array:
@@ -59,7 +57,7 @@ def bound_substeps(
             array(start, np.int32, wp.int32),
             array(spring[order], np.int32, wp.int32),
             own,
-            array(direction, np.float64, wp.vec3d),
+            array(unit(offset), np.float64, wp.vec3d),
             array(master.length, np.float64, wp.float64),
             array(master.rank, np.int32, wp.int32),
             array(limits, np.float64, wp.float64),
@@ -68,15 +66,14 @@ def bound_substeps(
         device=device,
     )
     most = zip(*(load.numpy().max(axis=1, initial=0.0) for load in loads), strict=True)
-    steps = [critical_step(float(stiffness), float(damping)) for stiffness, damping in most]
     return [
-        max(1, math.ceil(safety / (parameters.simulated_frame_rate * step)))
-        for parameters, step in zip(candidates, steps, strict=True)
+        substeps_of(critical_step(float(stiffness), float(damping)), parameters, safety)
+        for parameters, (stiffness, damping) in zip(candidates, most, strict=True)
     ]
 
 
 def _limits(parameters: SimulationParameters) -> list[list[float]]:
-    """List what `kernels.substeps.find_loads` reads of a candidate."""
+    """List what `kernels.batch.loads.find_loads` reads of a candidate."""
     return [
         [
             radius,

@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from physhandi.simulation.engines.cuda import LEAST_OWN, CudaEngine, most_large_locals
 from physhandi.simulation.engines.partition import Partition, bisect_nodes
-from physhandi.simulation.kernels.batch import (
+from physhandi.simulation.kernels.batch.substep import (
     hold_springs,
     interleave_states,
     note_first_divergence,
@@ -240,8 +240,8 @@ class SideBySide:
             control: Positions of the control nodes [m].
 
         Yields:
-            Frame, the states of all bodies as `kernels.batch` interleaves groups of one, and the
-            frame in which each diverged, -1 for none.
+            Frame, the states of all bodies as `kernels.batch.substep` interleaves groups of one,
+            and the frame in which each diverged, -1 for none.
         """
         path = self.array(control.reshape(-1, 3), wp.vec3)
         state = wp.zeros(6 * self._count * self.nodes, dtype=wp.float32, device=self.device)

@@ -9,7 +9,7 @@ import warp as wp
 from physhandi.errors import UsageError
 from physhandi.simulation.engines import batch
 from physhandi.simulation.engines.batch import BatchSimulator, Population
-from physhandi.simulation.kernels.batch import BLOCK_NODES
+from physhandi.simulation.kernels.batch.substep import BLOCK_NODES
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator

@@ -6,7 +6,7 @@ import warp as wp
 
 from physhandi.simulation.engines.batch_blocks import GroupBlocks, share_blocks
 from physhandi.simulation.engines.partition import bisect_nodes
-from physhandi.simulation.kernels.batch_frame import GROUP_WIDTH, PHASE, TILE, arrange_entries
+from physhandi.simulation.kernels.batch.frame import GROUP_WIDTH, PHASE, TILE, arrange_entries
 
 NODES, GROUPS, BLOCKS = 150, 2, 7
 

@@ -13,7 +13,7 @@ in different banks; `arrange_entries` orders the half-edges of nodes such that m
 
 import warp as wp
 
-from physhandi.simulation.kernels.batch import CANDIDATE_FIELDS
+from physhandi.simulation.kernels.batch.substep import CANDIDATE_FIELDS
 from physhandi.simulation.kernels.contacts import advance
 from physhandi.simulation.kernels.cuda_frame import control_position, control_velocity, pull
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast

@@ -1,12 +1,12 @@
 """Distance of the motion of each of many candidates from the observation, frame by frame.
 
 Every thread adds up a few terms of one candidate; neighbouring threads are candidates, whose
-states lie side by side (see `kernels.batch`). Sums have a fixed order.
+states lie side by side (see `kernels.batch.substep`). Sums have a fixed order.
 """
 
 import warp as wp
 
-from physhandi.simulation.kernels.batch import place_of
+from physhandi.simulation.kernels.batch.substep import place_of
 
 wp.set_module_options({"enable_backward": False})
 
