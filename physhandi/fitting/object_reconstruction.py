@@ -7,9 +7,12 @@
 import hashlib
 import json
 import logging
-from collections.abc import Callable
+import math
+from collections import Counter
+from collections.abc import Callable, Container
 from collections.abc import Sequence as Many
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -52,6 +55,8 @@ from physhandi.simulation.topology import MINIMUM_LENGTH
 logger = logging.getLogger(__name__)
 _DIGEST = 16
 """Bytes by which a candidate is told from others."""
+_DIVERGED, _TOO_FINE, _LOOSE = "diverged", "too fine", "loose"
+"""Why a candidate cannot be simulated."""
 CATCHING_SPEED = 1000.0
 """Speed from which nodes count as diverged where all candidates exceed the usual one [m/s]. Springs
 of millimetres that take hold of a node centimetres away move it at 200 m/s, and are stable."""
@@ -82,7 +87,7 @@ def search_object(
         checkpointer: Keeps the losses of all candidates; None keeps nothing.
 
     Raises:
-        FitError: If no spring can form, or every candidate diverges.
+        FitError: If no spring can form, or no candidate can be simulated; says why.
     """
     search = config.search
     if search.generations:
@@ -104,11 +109,16 @@ def search_object(
     )
     progress = _ResumedSearch(progress, known_losses)
     try:
-        return search_parameters(evaluate, start, search, progress)
+        result = search_parameters(evaluate, start, search, progress)
     except FitError:
+        if not evaluate.failures[_DIVERGED]:
+            raise FitError(evaluate.explain_failures()) from None
         if start.speed_limit >= CATCHING_SPEED:
             raise
-    return search_parameters(evaluate, start.replace(speed_limit=CATCHING_SPEED), search, progress)
+        start = start.replace(speed_limit=CATCHING_SPEED)
+        result = search_parameters(evaluate, start, search, progress)
+    is_batched = wp.get_device(device).is_cuda
+    return evaluate.best_that_holds(result) if is_batched else result
 
 
 class _KnownLosses:
@@ -336,6 +346,9 @@ class CandidateEvaluator:
         self._preview = RolloutPreview(SEARCH_STAGE, progress)
         self._best_loss = np.inf
         self._best: SimulationParameters | None = None
+        self._judged: list[tuple[float, SimulationParameters]] = []
+        self.failures = Counter[str]()
+        """Candidates that could not be simulated, by the reason."""
         self._has_kernels = False
         self._known_losses = known_losses or _KnownLosses(Checkpointer())
 
@@ -358,6 +371,12 @@ class CandidateEvaluator:
                 for parameters, (substeps, _) in zip(candidates, recalled, strict=True)
             ]
             mean = [loss for _, loss in recalled]
+            self._note_failures(settled, mean)
+        self._judged += [
+            (loss, parameters)
+            for parameters, loss in zip(settled, mean, strict=True)
+            if math.isfinite(loss)
+        ]
         winner = int(np.argmin(mean))
         if mean[winner] < self._best_loss:
             self._best_loss, self._best = mean[winner], settled[winner]
@@ -399,13 +418,61 @@ class CandidateEvaluator:
         for row, master in enumerate(masters):
             self._simulate(row, master, settled, possible, losses[row])
         mean = [float(value) for value in losses.mean(axis=0)]
-        winner = int(np.argmin(mean))
-        while is_batched and mean[winner] < self._best_loss:
-            if self._holds_alone(masters, settled[winner]):
-                break
-            mean[winner] = np.inf
-            winner = int(np.argmin(mean))
+        self._note_failures(settled, mean, set(possible))
         return settled, mean
+
+    def _note_failures(
+        self,
+        settled: Many[SimulationParameters],
+        losses: list[float],
+        possible: Container[int] | None = None,
+    ) -> None:
+        """Count why candidates have no loss.
+
+        Args:
+            settled: The candidates.
+            losses: Of each, infinite where there is none.
+            possible: Those that were simulated; those with few enough substeps if not known.
+        """
+        for index, (parameters, loss) in enumerate(zip(settled, losses, strict=True)):
+            if math.isfinite(loss):
+                continue
+            is_fine = parameters.substeps_per_frame > self._config.most_substeps
+            is_loose = possible is not None and index not in possible
+            self.failures[_TOO_FINE if is_fine else _LOOSE if is_loose else _DIVERGED] += 1
+
+    def explain_failures(self) -> str:
+        """Say why no candidate could be simulated, and what to do."""
+        too_fine, loose = self.failures[_TOO_FINE], self.failures[_LOOSE]
+        reasons = [
+            f"{too_fine} need more than {self._config.most_substeps} substeps a frame (lower the "
+            "upper end of the stiffness interval, or raise most_substeps)"
+        ] * bool(too_fine)
+        reasons += [
+            f"{loose} form no springs (raise connection_radius and virtual_connection_radius, or "
+            "the lower ends of their intervals)"
+        ] * bool(loose)
+        return f"No candidate of the search can be simulated: {'; '.join(reasons)}."
+
+    def best_that_holds(self, result: SearchResult) -> SearchResult:
+        """Return a search's result, with the best candidate that does not diverge on its own.
+
+        In a batch on CUDA sums are rounded otherwise, and what nearly diverges may do so alone.
+
+        Raises:
+            FitError: If all diverge alone.
+        """
+        if not math.isfinite(result.loss_after):
+            return result
+        found = result.loss_after, result.parameters
+        worse = [each for each in self._judged if each[0] >= found[0] and each[1] != found[1]]
+        for loss, parameters in (found, *sorted(worse, key=lambda each: each[0])):
+            if self._holds_alone(parameters):
+                return replace(result, parameters=parameters, loss_after=loss)
+        raise FitError(
+            f"All {1 + len(worse)} candidates that do not diverge in a batch do so alone. Lower "
+            "the upper end of the stiffness interval or raise substeps_per_frame in the profile."
+        )
 
     def _settle(
         self, masters: Many[MasterTopology], candidates: Many[SimulationParameters]
@@ -431,14 +498,11 @@ class CandidateEvaluator:
             for parameters, *of_masters in zip(candidates, *needed, strict=True)
         ]
 
-    def _holds_alone(self, masters: Many[MasterTopology], parameters: SimulationParameters) -> bool:
-        """Tell whether a candidate does not diverge when it is simulated alone.
-
-        In a batch sums are rounded otherwise, and what nearly diverges may do so alone.
-        """
+    def _holds_alone(self, parameters: SimulationParameters) -> bool:
         try:
-            for problem, master in zip(self._problems, masters, strict=True):
-                simulate_problem(problem, master.model(parameters), parameters, self._device)
+            for problem in self._problems:
+                model = build_problem_model(problem, parameters)
+                simulate_problem(problem, model, parameters, self._device)
         except SimulationDivergedError:
             return False
         return True

@@ -29,9 +29,8 @@ from physhandi.simulation.kernels.cuda_large_frame import (
     make_large_frame_kernel,
     pack_half_edges,
 )
+from physhandi.simulation.kernels.half_edges import WARP, arrange_half_edges
 
-WARP = 32
-"""Threads of a warp."""
 LEAST_OWN = 4
 """Nodes of a block; with fewer, synchronisation costs more than the parallel work saves."""
 MOST_LANES = 576
@@ -66,47 +65,45 @@ class HalfEdgeColumns:
 
     chunk_count: int
     """Chunks of each block."""
-    start: Int32[ndarray, " group_1"]
-    """Start of each group's half-edges: block by block, chunk by chunk, warp by warp."""
-    place: Int32[ndarray, " slot"]
+    start: wp.array
+    """Start of each group's half-edges: block by block, chunk by chunk, warp by warp; and the end
+    of all. Numbers of groups and one more."""
+    place: wp.array
     """Place of the other end in the block's part of `local_node`; padding ends where it begins."""
-    spring: Int32[ndarray, " slot"]
+    spring: wp.array
     """Number of its spring; -1 for padding."""
 
 
-def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeColumns:
+def arrange_columns(
+    partition: Partition, tables: list[wp.array], lanes: int, threads: int
+) -> HalfEdgeColumns:
     """Assign half-edges to threads.
 
     Args:
         partition: Blocks and their nodes' half-edges.
+        tables: Its `own_start`, `entry_start` and `entry` on the device.
         lanes: Threads that sum one node's springs; divides 32.
         threads: Threads of a block; a multiple of 32.
     """
     rows, warps = threads // lanes, threads // WARP
-    own_count = np.diff(partition.own_start)
     chunks = -(-partition.most_own // rows)
-    block = np.repeat(np.arange(partition.block_count), own_count)
+    block = np.repeat(np.arange(partition.block_count), np.diff(partition.own_start))
     chunk, row = np.divmod(np.arange(len(block)) - partition.own_start[block], rows)
     group = (block * chunks + chunk) * warps + row * lanes // WARP
-    degree = np.diff(partition.entry_start)
     count = np.zeros(partition.block_count * chunks * warps, dtype=np.int64)
-    np.maximum.at(count, group, -(-degree // lanes))
+    np.maximum.at(count, group, -(-np.diff(partition.entry_start) // lanes))
     start = WARP * np.concatenate([[0], np.cumsum(count)])
-
-    turn, warp = np.divmod(np.repeat(np.arange(len(count)), WARP * count), warps)
-    thread = WARP * warp + np.arange(len(turn)) % WARP
-    place = np.minimum(turn % chunks * rows + thread // lanes, own_count[turn // chunks] - 1)
-    spring = np.full(len(place), -1)
-    node = np.repeat(np.arange(len(block)), degree)
-    column, lane = np.divmod(np.arange(len(node)) - partition.entry_start[node], lanes)
-    slot = start[group[node]] + WARP * column + (row[node] * lanes + lane) % WARP
-    place[slot], spring[slot] = partition.entry.T
-    return HalfEdgeColumns(
-        chunk_count=chunks,
-        start=start.astype(np.int32),
-        place=place.astype(np.int32),
-        spring=spring.astype(np.int32),
+    device = tables[0].device
+    starts = wp.array(start.astype(np.int32), dtype=wp.int32, device=device)
+    place, spring = (wp.empty(int(start[-1]), dtype=wp.int32, device=device) for _ in range(2))
+    wp.launch(
+        arrange_half_edges,
+        dim=(len(count), WARP),
+        inputs=[chunks, warps, lanes, *tables, starts],
+        outputs=[place, spring],
+        device=device,
     )
+    return HalfEdgeColumns(chunk_count=chunks, start=starts, place=place, spring=spring)
 
 
 def most_large_locals(device: Any) -> int:
@@ -149,12 +146,20 @@ class LargeLayout:
 class LargeFrames:
     """The half-edges of one model as the large frame kernel reads them."""
 
-    def __init__(self, simulator: FrameHost, partition: Partition, *, few_kernels: bool) -> None:
-        """Copy the half-edges to the device.
+    def __init__(
+        self,
+        simulator: FrameHost,
+        partition: Partition,
+        tables: list[wp.array],
+        *,
+        few_kernels: bool,
+    ) -> None:
+        """Arrange the half-edges on the device.
 
         Args:
             simulator: Its state, controls, material and world are read and written.
             partition: Blocks of its model; they must fit the device.
+            tables: See `arrange_columns`.
             few_kernels: Whether one kernel serves models that keep different numbers of half-edges.
         """
         self._simulator = simulator
@@ -162,12 +167,9 @@ class LargeFrames:
         self.layout = LargeLayout.of(partition, most_large_locals(simulator.device))
         if few_kernels:
             self.layout = replace(self.layout, in_registers=MOST_KEPT)
-        columns = arrange_columns(partition, self.layout.lanes, self.layout.threads)
-        self._chunk_count = columns.chunk_count
-        self._start = simulator.array(columns.start, wp.int32)
-        self._place = simulator.array(columns.place, wp.int32)
-        self._spring = simulator.array(columns.spring, wp.int32)
-        self._packed = wp.zeros(len(columns.place), dtype=wp.vec4, device=simulator.device)
+        lanes, threads = self.layout.lanes, self.layout.threads
+        self._columns = arrange_columns(partition, tables, lanes, threads)
+        self._packed = wp.zeros(len(self._columns.place), dtype=wp.vec4, device=simulator.device)
 
     def advance(
         self,
@@ -187,18 +189,19 @@ class LargeFrames:
             before: State at its start.
             after: Where the state at its end goes; may be the same arrays.
         """
-        simulator, layout = self._simulator, self.layout
+        simulator, layout, columns = self._simulator, self.layout, self._columns
         # Material and world may have changed on the device; packing is cheap beside a frame.
         wp.launch(
             pack_half_edges,
-            dim=len(self._place),
-            inputs=[simulator.world, self._place, self._spring, *simulator.material],
+            dim=len(columns.place),
+            inputs=[simulator.world, columns.place, columns.spring, *simulator.material],
             outputs=[self._packed],
             device=simulator.device,
         )
-        inputs: list[Any] = [self._chunk_count, simulator.parameters.substeps_per_frame, tag]
+        inputs: list[Any] = [columns.chunk_count, simulator.parameters.substeps_per_frame, tag]
         body, *places = blocks
-        inputs += [simulator.world, body, simulator.clearance, *places, self._start, self._packed]
+        inputs += [simulator.world, body, simulator.clearance, *places]
+        inputs += [columns.start, self._packed]
         wp.launch(
             large_frame_kernel(layout.lanes, layout.in_registers, layout.threads, layout.locals),
             dim=self._block_count * layout.threads,
@@ -296,7 +299,8 @@ class CudaEngine:
         is_large = is_large or (has_many and not layout.holds(partition))
         self.large: LargeFrames | None = None
         if is_large:
-            self.large = LargeFrames(simulator, partition, few_kernels=has_many)
+            tables = [self._map[0], *self._map[4:]]
+            self.large = LargeFrames(simulator, partition, tables, few_kernels=has_many)
 
     @staticmethod
     def of(simulator: EngineHost) -> "CudaEngine | None":

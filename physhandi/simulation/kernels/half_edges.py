@@ -1,10 +1,59 @@
-"""The springs at a node, as the threads of a CUDA block keep them in registers.
+"""The springs at a node, as the threads of a CUDA block read them or keep them in registers.
 
 Each spring is there twice, once for each end: a half-edge. The lanes of a row, which are
 neighbouring threads, share the half-edges of one node.
 """
 
 import warp as wp
+
+WARP = 32
+"""Threads of a warp."""
+
+
+@wp.kernel(enable_backward=False)
+def arrange_half_edges(
+    chunks: int,
+    warps: int,
+    lanes: int,
+    own_start: wp.array[int],
+    entry_start: wp.array[int],
+    entry: wp.array[wp.vec2i],
+    start: wp.array[int],
+    place_out: wp.array[int],
+    spring_out: wp.array[int],
+):
+    """Copy the half-edges of each thread to its places in the columns of its group.
+
+    Args:
+        chunks: Chunks of each block, of as many nodes as it has rows of threads.
+        warps: Warps of each block.
+        lanes: Threads that sum one node's springs.
+        own_start: First own node of each block.
+        entry_start: First half-edge of each node.
+        entry: Half-edges: place of the other end, and spring.
+        start: Start of each group's columns; a group is a warp of a chunk of a block.
+        place_out: Places of the other ends; padding ends where it begins.
+        spring_out: Springs; -1 for padding.
+    """
+    group, lane = wp.tid()
+    turn = group // warps
+    thread = WARP * (group % warps) + lane
+    block = turn // chunks
+    first = own_start[block]
+    own = own_start[block + 1] - first
+    row = (turn % chunks) * (WARP * warps // lanes) + thread // lanes
+    begin = int(0)
+    end = int(0)
+    if row < own:
+        begin = entry_start[first + row] + thread % lanes
+        end = entry_start[first + row + 1]
+    for slot in range(start[group] + lane, start[group + 1], WARP):
+        place_out[slot] = wp.min(row, own - 1)
+        spring_out[slot] = -1
+        if begin < end:
+            place_out[slot] = entry[begin][0]
+            spring_out[slot] = entry[begin][1]
+        begin += lanes
 
 
 @wp.func

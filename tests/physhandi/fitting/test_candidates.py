@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import warp as wp
 from support.waiting import LIMIT_S
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.errors import CancelledError, SimulationDivergedError
+from physhandi.errors import CancelledError, FitError, SimulationDivergedError
 from physhandi.fitting import object_reconstruction
 from physhandi.fitting.config import ObjectFitConfig
 from physhandi.fitting.object_problem import (
@@ -21,6 +22,7 @@ from physhandi.fitting.object_problem import (
     mean_loss,
 )
 from physhandi.fitting.object_reconstruction import CandidateEvaluator
+from physhandi.fitting.search import SearchResult
 from physhandi.progress import NullProgress, Preview, Progress
 from physhandi.simulation.engines.batch import BatchSimulator, shared_out
 from physhandi.simulation.master_topology import MasterTopology
@@ -280,26 +282,32 @@ def test_a_candidate_that_fails_in_its_thread_is_told(monkeypatch: pytest.Monkey
         evaluate(drawn(3))
 
 
-@pytest.mark.gpu
-def test_the_best_of_a_batch_must_hold_alone_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    if not wp.is_cuda_available():
-        pytest.skip("needs a CUDA device")
-    problems, candidates = [sheet("slow", 0.05)], drawn(3)
-    before = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), device="cuda:0")
-    losses = [loss for _, loss in before(candidates)]
-    best = int(np.argmin(losses))
+def test_the_best_of_a_search_must_hold_alone_too(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluate = CandidateEvaluator(
+        [sheet("slow", 0.05)], ObjectFitConfig(), NullProgress(), device=device
+    )
+    best, second, *_ = sorted(evaluate(drawn(4)), key=lambda each: each[1])
+    found = SearchResult(
+        parameters=best[0], loss_before=1.0, loss_after=best[1], curve=[[1.0, 1.0]], widened=("x",)
+    )
+    assert evaluate.best_that_holds(found) == found
     alone = object_reconstruction.simulate_problem
+    falling = {best[0].stiffness}
 
     def diverging(problem, model, parameters, device):
-        if parameters.stiffness == candidates[best].stiffness:
+        if parameters.stiffness in falling:
             raise SimulationDivergedError("too fast", frame=1, substep=0, node=0)
         return alone(problem, model, parameters, device)
 
     monkeypatch.setattr(object_reconstruction, "simulate_problem", diverging)
-    evaluate = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), device="cuda:0")
-    judged = [loss for _, loss in evaluate(candidates)]
-    losses[best] = math.inf
-    assert judged == losses
+    assert evaluate.best_that_holds(found) == replace(
+        found, parameters=second[0], loss_after=second[1]
+    )
+    falling |= {parameters.stiffness for parameters, _ in evaluate(drawn(4))}
+    with pytest.raises(FitError, match=r"All \d+ candidates .* do so alone"):
+        evaluate.best_that_holds(found)
 
 
 def test_a_batch_gets_substeps_that_are_enough_for_each_of_its_sequences() -> None:

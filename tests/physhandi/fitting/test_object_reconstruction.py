@@ -199,6 +199,19 @@ def test_a_search_that_finds_nothing_slow_looks_for_what_is_fast_and_stable() ->
         search_object(problems, stiff, unstable.replace(search=search), NullProgress())
 
 
+def test_a_search_that_cannot_simulate_anything_says_why_and_ends() -> None:
+    settings = config()
+    evaluations = 1 + settings.search.generations * settings.search.population
+    frugal = settings.replace(automatic_substeps=False, most_substeps=9)
+    start = PARAMETERS.replace(substeps_per_frame=10)
+    with pytest.raises(FitError, match=f": {evaluations} need more than 9 substeps a frame"):
+        search_object([held_sheet("slow", 0.2)], start, frugal, NullProgress())
+    # Near enough for a spring, but no neighbor is allowed.
+    bare = PARAMETERS.replace(max_neighbors=0, virtual_max_neighbors=0)
+    with pytest.raises(FitError, match=f": {evaluations} form no springs"):
+        search_object([held_sheet("slow", 0.2)], bare, settings, NullProgress())
+
+
 def test_objects_that_differ_are_refused() -> None:
     first, second = held_sheet("slow", 0.2), held_sheet("fast", 0.2)
     stretched = replace(second, rest_node=(NODE * [1.0, 2.5, 1.0]).astype(np.float32))
