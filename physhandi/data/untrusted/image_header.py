@@ -20,9 +20,21 @@ MOST_PIXELS = 50_000_000
 """Pixels of the largest image that is decoded: 8,192 x 6,144."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
-_ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
-_TAIL = 2048
-"""Bytes at the end of a file in which its end is looked for."""
+_MOST_CHUNKS = 1 << 17
+"""Chunks of a PNG that are passed; the largest image in chunks of 4 kB has fewer."""
+_MARKER = b"\x02\x01"
+"""A byte 0xff and one that makes both a marker, by `_MARKER_PARTS`."""
+_MARKER_PARTS = bytes(
+    2 if byte == 0xFF else 1 if 0xC0 <= byte <= 0xCF or byte >= 0xD8 else 0 for byte in range(256)
+)
+"""What each byte may be of a marker that begins a segment of a JPEG, or begins or ends a picture.
+
+In a coded picture, 0x00 or a restart (0xd0 to 0xd7) follows each 0xff; any 0xff before a marker
+fills.
+"""
+_BEGIN, _END = 0xD8, 0xD9
+_BLOCK = 1 << 14
+"""Bytes of a JPEG in which a marker is looked for at once."""
 _MOST_SEGMENTS = 4096
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """Numbers a pixel of each color type of PNG."""
@@ -98,6 +110,8 @@ def announced_image(path: Path) -> AnnouncedImage:
 def is_whole(path: Path, form: ImageForm) -> bool:
     """Tell whether an image has its end; decoders fill what is missing without a word.
 
+    What follows the end is no part of it: cameras append a second picture, programs what they know.
+
     Args:
         path: File with a sound header; an ``.npy`` file without its end has none.
         form: Its format.
@@ -107,9 +121,10 @@ def is_whole(path: Path, form: ImageForm) -> bool:
     if form == "NPY":
         return True
     with path.open("rb") as stream:
-        stream.seek(0, 2)
-        stream.seek(max(0, stream.tell() - _TAIL))
-        return _ENDS[form] in stream.read()
+        try:
+            return _ends_as_png(stream) if form == "PNG" else _END in _jpeg_markers(stream)
+        except struct.error:
+            return False
 
 
 def check_pixels(size: tuple[int, int], path: Path) -> None:
@@ -218,24 +233,64 @@ def _png(start: bytes, file_size: int) -> AnnouncedImage:
     return AnnouncedImage("PNG", width, height, channels, number)
 
 
+def _ends_as_png(stream: BinaryIO) -> bool:
+    """Go from chunk to chunk until the last one, and tell whether that is whole.
+
+    Raises:
+        struct.error: If the file ends before it.
+    """
+    stream.seek(len(_PNG))
+    for _ in range(_MOST_CHUNKS):
+        length, kind = struct.unpack(">I4s", stream.read(8))
+        if kind == b"IEND":
+            return length == 0 and len(stream.read(4)) == 4
+        stream.seek(length + 4, 1)  # Content and checksum.
+    return False
+
+
 def _jpeg(stream: BinaryIO) -> AnnouncedImage:
     """Go from segment to segment until the one that describes the frame."""
-    stream.seek(2)
-    for _ in range(_MOST_SEGMENTS):
-        byte = stream.read(1)
-        while byte not in {b"\xff", b""}:
-            byte = stream.read(1)
-        while byte == b"\xff":
-            byte = stream.read(1)
-        (marker,) = struct.unpack("B", byte)
-        if 0xD0 <= marker <= 0xD9 or marker == 0x01:
-            continue
-        (length,) = struct.unpack(">H", stream.read(2))
+    for marker in _jpeg_markers(stream):
         if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
             height, width, channels = struct.unpack(">xHHB", stream.read(6))
             return AnnouncedImage("JPEG", width, height, channels, np.dtype(np.uint8))
-        stream.seek(length - 2, 1)
     raise ValueError("has no size in its JPEG header")
+
+
+def _jpeg_markers(stream: BinaryIO) -> Iterator[int]:
+    """Walk through the segments of a JPEG (ITU-T T.81) until it ends, or another one begins.
+
+    Gives the marker of each and leaves the stream where its content begins. Small pictures of a
+    header lie in segments of their own, which are passed over.
+
+    Raises:
+        struct.error: If the file ends before.
+    """
+    stream.seek(len(_JPEG))
+    for _ in range(_MOST_SEGMENTS):
+        marker = _next_marker(stream)
+        if marker in {_BEGIN, _END}:
+            yield marker
+            return
+        (length,) = struct.unpack(">H", stream.read(2))
+        if length < 2:  # It counts its own bytes.
+            return
+        following = stream.tell() + length - 2
+        yield marker
+        stream.seek(following)
+
+
+def _next_marker(stream: BinaryIO) -> int:
+    """Find the next marker, in a coded picture too; the stream goes on behind it."""
+    last = b""
+    while block := stream.read(_BLOCK):
+        block = last + block
+        at = block.translate(_MARKER_PARTS).find(_MARKER)
+        if at >= 0:
+            stream.seek(at + 2 - len(block), 1)
+            return block[at + 1]
+        last = block[-1:]  # A marker may lie across two blocks.
+    raise struct.error("no marker is left")
 
 
 def _exr(stream: BinaryIO) -> AnnouncedImage:
