@@ -19,7 +19,12 @@ from numpy import ndarray
 from physhandi.child import Channel, Child, ChildEndedError, run_child
 from physhandi.data.importers.phystwin_files import fail
 from physhandi.data.importers.record3d import RECORD3D_SUFFIX, unpack_record3d
-from physhandi.data.importers.recorded_view import CALIBRATION
+from physhandi.data.importers.recorded_view import (
+    CALIBRATION,
+    LONGEST_NAME,
+    camera_folders,
+    holds_streams,
+)
 from physhandi.data.untrusted.image_header import MOST_PIXELS
 from physhandi.data.untrusted.pickles import limit_data
 from physhandi.errors import UsageError
@@ -49,6 +54,8 @@ _WORKER = "physhandi.data.importers.bag"
 _MEMORY = 4 << 30
 """Most memory that reading a bag may take [byte]."""
 _PNG_EFFORT = 1
+_LONGEST_NAME = 40
+"""Letters of the name of a bag, or of a camera in it, that count."""
 
 
 @dataclass(eq=False)
@@ -65,16 +72,62 @@ class _Topic:
 
 
 def find_bags(source: Path) -> list[Path]:
-    """List the bags of a source: itself, or the files in a folder; none if it holds no bag."""
+    """List the bags of a source: itself, those in a folder, or those in one folder for each camera.
+
+    Those in folders count if nothing there is a camera's images: there, bags are what these were
+    made of.
+
+    Raises:
+        ImportFailedError: See `holds_streams`.
+    """
     if source.is_file():
         return [source] if source.suffix.lower() in BAG_SUFFIXES else []
     if not source.is_dir():
         return []
     if (source / "metadata.yaml").is_file():
         return [source]
-    files = [path for path in source.iterdir() if path.suffix.lower() in BAG_SUFFIXES]
-    folders = [path for path in source.iterdir() if (path / "metadata.yaml").is_file()]
-    return sorted([*files, *folders])
+    own = _bags_in(source)
+    if own:
+        return own
+    inner = [bag for folder in camera_folders(source) for bag in _bags_in(folder)]
+    return inner if inner and not holds_streams(source) else []
+
+
+def _bags_in(folder: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file()
+    )
+
+
+def name_bags(source: Path, bags: list[Path]) -> list[str]:
+    """Say what each bag calls its camera; nothing if there is one bag, whose topics tell.
+
+    Args:
+        source: Where the bags were found.
+        bags: The bags.
+
+    Raises:
+        ImportFailedError: If two bags name theirs alike.
+    """
+    named: dict[str, Path] = {}
+    folders = [bag.parent for bag in bags]
+    for bag in bags:
+        if source in {bag, bag.parent}:
+            name = bag.stem if len(bags) > 1 else ""
+        else:
+            is_alone = folders.count(bag.parent) == 1
+            name = bag.parent.name if is_alone else f"{bag.parent.name}_{bag.stem}"
+        other = named.setdefault(_safe(name), bag)
+        if other is not bag:
+            fail(
+                bag,
+                f"names its camera '{_safe(name)}', as {other} does. Name each after its camera "
+                f"(the first {_LONGEST_NAME} letters, digits, - and _ count), and keep one if both "
+                "are one recording",
+            )
+    return list(named)
 
 
 def unpack_bags(source: Path, bags: list[Path], folder: Path, progress: Progress) -> None:
@@ -89,7 +142,8 @@ def unpack_bags(source: Path, bags: list[Path], folder: Path, progress: Progress
         progress: Told after every image; may cancel.
 
     Raises:
-        ImportFailedError: If a bag is broken or holds no images; names the bag and the topic.
+        ImportFailedError: If a bag is broken or holds no images, or two name their cameras alike;
+            names the bag and the topic.
         UsageError: If the package that reads bags is not installed.
     """
     ros = [bag for bag in bags if bag.suffix.lower() != RECORD3D_SUFFIX]
@@ -98,9 +152,9 @@ def unpack_bags(source: Path, bags: list[Path], folder: Path, progress: Progress
             f"Reading {ros[0].name} needs the package rosbags, which is not installed: pip "
             "install 'physhandi[capture]'."
         )
+    names = name_bags(source, bags)
     folder.mkdir()
-    for bag in bags:
-        prefix = _safe(bag.stem) if len(bags) > 1 else ""
+    for bag, prefix in zip(bags, names, strict=True):
         _unpack_apart(bag, folder, prefix, progress)
     if source in bags:
         return  # What lies beside a single bag may belong to anything.
@@ -173,7 +227,9 @@ def _unpack_open(bag: Path, reader: Any, folder: Path, prefix: str, progress: Pr
     done = 0
     for key, topics in cameras.items():
         parts = [part for part in (prefix, key if not prefix or len(cameras) > 1 else "") if part]
-        view = folder / ("_".join(parts) or "view0")
+        view = folder / ("_".join(parts) or "view0")[:LONGEST_NAME]
+        if view.exists():
+            fail(bag, f"has a camera '{view.name}', as there is one already. Rename the bag")
         view.mkdir()
         for topic in topics:
             kind = "depth" if topic.is_depth else "color"
@@ -243,7 +299,7 @@ def _camera_name(topic: str) -> str:
 
 
 def _safe(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name)[:40]
+    return re.sub(r"[^A-Za-z0-9_-]", "_", name)[:_LONGEST_NAME]
 
 
 def _info(reader: Any, infos: Mapping[str, Any], topic: str) -> Any:

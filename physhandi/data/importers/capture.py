@@ -18,7 +18,7 @@ from physhandi.data import sequence as sequences
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.depth_scale import KNOWN_SCALES, LARGEST_SCALE
 from physhandi.data.files import temporary_name
-from physhandi.data.importers.bag import find_bags, unpack_bags
+from physhandi.data.importers.bag import find_bags, name_bags, unpack_bags
 from physhandi.data.importers.board_calibration import (
     AprilGrid,
     Board,
@@ -336,10 +336,12 @@ def survey_capture(source: Path | str, options: CaptureOptions | None = None) ->
         options: What the recording does not say itself.
     """
     source, options = Path(source), options or CaptureOptions()
-    bags = find_bags(source)
-    if bags:
-        return CaptureSurvey(bags=tuple(bag.name for bag in bags))
     try:
+        bags = find_bags(source)
+        if bags:
+            name_bags(source, bags)
+            places = [bag.relative_to(source) for bag in bags if bag != source]
+            return CaptureSurvey(bags=tuple(map(str, places)) or (source.name,))
         with _closing(find_views(source, options.intrinsics)) as views:
             _refuse_same_names(views)
             return _surveyed(source, views, options)

@@ -34,6 +34,8 @@ from physhandi.errors import ImportFailedError
 
 CALIBRATION = "calibration"
 """Folder of the pictures of the board, one folder a view."""
+LONGEST_NAME = 64
+"""Letters of a folder's name that count for its view."""
 _TABLES = (".json", ".yaml", ".yml")
 _INTRINSICS = (
     *("intrinsics", "color_intrinsics", "rgb_intrinsics", "camera_intrinsic", "camera_info"),
@@ -108,11 +110,12 @@ def find_views(source: Path, intrinsics: Path | None = None) -> list[RecordedVie
         )
     if (source / "metadata.json").is_file() and _numbered(source / "color"):
         return _phystwin_views(source)
-    folders = _camera_folders(source)
+    folders = _views_of(source)
     if not folders:
         raise ImportFailedError(
             f"{source} holds no recording: neither it nor a folder in it has color or depth (as "
-            "color/00000.png or color.mp4, and depth/00000.png or .npy)."
+            "color/00000.png or color.mp4, and depth/00000.png or .npy), or a bag (.bag, .db3, "
+            ".mcap, .r3d)."
         )
     shared = _shared_table(source, intrinsics)
     poses = _shared_poses(source, [item.name for item in folders])
@@ -134,14 +137,30 @@ def _numbered(folder: Path) -> list[Path]:
     return sorted(items, key=lambda item: int(item.stem))
 
 
-def _camera_folders(source: Path) -> list[_Folder]:
+def camera_folders(source: Path) -> list[Path]:
+    """List the folders in a recording that may each be a camera's."""
+    return [
+        folder
+        for folder in sorted(source.iterdir())
+        if folder.is_dir() and not folder.name.startswith(".") and folder.name != CALIBRATION
+    ]
+
+
+def holds_streams(source: Path) -> bool:
+    """Tell whether a folder, or one in it, holds color or depth as images or a video.
+
+    Raises:
+        ImportFailedError: See `find_views`.
+    """
+    return any(_streams(folder, "") is not None for folder in [source, *camera_folders(source)])
+
+
+def _views_of(source: Path) -> list[_Folder]:
     own = _streams(source, "view0")
     if own is not None:
         return [own]
     folders: list[_Folder] = []
-    for folder in sorted(source.iterdir()):
-        if not folder.is_dir() or folder.name.startswith(".") or folder.name == CALIBRATION:
-            continue
+    for folder in camera_folders(source):
         streams = _streams(folder, _safe_name(folder.name, len(folders)))
         if streams is None:
             images = [path for path in folder.iterdir() if path.suffix.lower() in COLOR_SUFFIXES]
@@ -159,7 +178,7 @@ def _streams(folder: Path, name: str) -> _Folder | None:
 
 
 def _safe_name(name: str, number: int) -> str:
-    safe = "".join(c if SAFE_NAME.fullmatch(c) else "_" for c in name)[:64]
+    safe = "".join(c if SAFE_NAME.fullmatch(c) else "_" for c in name)[:LONGEST_NAME]
     return safe if safe.strip("_") else f"view{number}"
 
 

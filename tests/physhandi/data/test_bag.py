@@ -19,7 +19,7 @@ from support.inputs.recorded_bag import (
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers import bag as bag_reader
-from physhandi.data.importers.capture import CaptureOptions, import_capture
+from physhandi.data.importers.capture import CaptureOptions, import_capture, survey_capture
 from physhandi.errors import CancelledError, ImportFailedError, UsageError
 from physhandi.progress import NullProgress, Progress
 
@@ -119,11 +119,12 @@ def test_a_ros_2_bag_of_two_cameras(tmp_path, storage):
 
 
 def test_two_ros_1_bags_with_compressed_depth_and_a_tree_of_frames(tmp_path):
+    """Both are called alike, in a folder for each camera."""
     source = tmp_path / "takes"
-    source.mkdir()
     for name, color in (("one", camera_at(30, 2)), ("two", camera_at(80, 2))):
         depth = beside(color)
-        with Recorder(source / f"{name}.bag", ros=1) as bag:
+        (source / name).mkdir(parents=True)
+        with Recorder(source / name / "take.bag", ros=1) as bag:
             bag.info("/camera/color/camera_info", color)
             bag.info("/camera/depth/camera_info", depth)
             link = depth.T_camera_world @ color.T_world_camera
@@ -160,6 +161,66 @@ def test_two_ros_1_bags_with_compressed_depth_and_a_tree_of_frames(tmp_path):
     assert_depth_fits(sequence.views[1].depth(2), depth, color[..., 0] == 200)
 
 
+LAYOUTS: dict[str, tuple[str, dict[str, str]]] = {
+    "one": ("rec.bag", {"rec.bag": ""}),
+    "one in a folder": (".", {"rec.bag": ""}),
+    "two": (".", {"left.bag": "left", "right.db3": "right"}),
+    "one in the folder of its camera": (".", {"left/rec.bag": "left"}),
+    "called alike": (".", {"cam 1/rec.bag": "cam_1", "cam2/rec.bag": "cam2"}),
+    "two of a folder": (
+        ".",
+        {"left/1.mcap": "left_1", "left/2.mcap": "left_2", "right/1.mcap": "right"},
+    ),
+    "an older one in a folder": (".", {"left.bag": "left", "right.bag": "right", "old/a.bag": "-"}),
+    "pictures of the board": (".", {"left.bag": "", "calibration/right.bag": "-"}),
+    "ROS 2": (".", {"left/metadata.yaml": "left", "right/metadata.yaml": "right"}),
+    "ROS 2 in the folder of its camera": (".", {"left/rec/metadata.yaml": "left"}),
+    "images made of bags": (
+        ".",
+        {"left/rec.bag": "-", "right/rec.bag": "-", "right/depth/0.npy": "-"},
+    ),
+}
+"""The source, and the files there with the name that each gives its camera (-: it is no bag)."""
+
+
+@pytest.mark.parametrize("kind", LAYOUTS)
+def test_cameras_are_called_after_their_bags_or_folders(tmp_path, kind):
+    source, files = LAYOUTS[kind]
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / file, np.ones((2, 2))) if "npy" in file else (tmp_path / file).touch()
+    bags = bag_reader.find_bags(tmp_path / source)
+    places = {file.removesuffix("/metadata.yaml"): name for file, name in files.items()}
+    expected = {tmp_path / file: name for file, name in places.items() if name != "-"}
+    names = bag_reader.name_bags(tmp_path / source, bags)
+    assert dict(zip(bags, names, strict=True)) == expected
+    if bags:
+        found = [str(path.relative_to(tmp_path)) for path in bags]
+        assert list(survey_capture(tmp_path / source).bags) == found
+
+
+@pytest.mark.parametrize(
+    ("files", "name"),
+    [
+        (["rec.bag", "rec.db3"], "rec"),
+        (["cam 1/rec.bag", "cam_1/rec.bag"], "cam_1"),
+        ([f"{'x' * 40}1.bag", f"{'x' * 40}2.bag"], "x" * 40),
+        (["rec/metadata.yaml", "rec.bag"], "rec"),
+    ],
+)
+def test_bags_that_name_their_cameras_alike_are_refused_before_one_is_read(tmp_path, files, name):
+    for file in files:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    with pytest.raises(ImportFailedError) as refusal:
+        import_capture(tmp_path, tmp_path / "out")
+    message = str(refusal.value)
+    first, second = (tmp_path / file.removesuffix("/metadata.yaml") for file in files)
+    assert message.startswith(f"{second}: names its camera '{name}', as {first} does. ")
+    assert survey_capture(tmp_path).problems == (message,)
+    assert not (tmp_path / "out").exists()
+
+
 def reference() -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.array([0.4, -0.2, 1.0]))[0]
@@ -192,7 +253,13 @@ def test_broken_bags_are_refused_and_named(tmp_path):
         bag.info("/camera/color/camera_info", CAMERAS["left"])
     blind = small_bag(tmp_path / "blind.bag", has_no_info=True)
     odd = small_bag(tmp_path / "odd.bag", code="bayer_x")
+    twice = tmp_path / "twice.bag"
+    with Recorder(twice, ros=1) as bag:
+        for topic in ("/color", "/view0/color"):
+            bag.info(f"{topic}/camera_info", CAMERAS["left"])
+            bag.image(f"{topic}/image_raw", shown(CAMERAS["left"], 0)[0], "rgb8", time_of(0))
     for path, words in (
+        (twice, ("twice.bag", "camera 'view0'", "already")),
         (cut, ("cut.bag", "ended properly")),
         (empty, ("empty.bag", "no color or depth images", "camera_info")),
         (blind, ("blind.bag", "no CameraInfo", "/camera/color/image_raw")),
@@ -203,7 +270,7 @@ def test_broken_bags_are_refused_and_named(tmp_path):
         with pytest.raises(ImportFailedError) as refusal:
             read(path, tmp_path / "out")
         assert [word for word in words if word not in str(refusal.value)] == [], refusal.value
-    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag"] * 4
+    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag"] * 5
 
 
 class _Stops(Progress):
