@@ -212,7 +212,7 @@ def listed_poses(raw: RawCapture) -> None:
 EVEN = [100 + frame / 30 for frame in range(FRAMES)]
 POSE = CAMERAS["left"].T_world_camera
 REFUSED: dict[str, tuple[Damage, tuple[str, ...]]] = {
-    "no folder": (removed("."), ("raw is not a folder",)),
+    "no folder": (removed("."), ("raw does not exist",)),
     "empty folder": (removed("left", "right"), ("holds no recording", "color/00000.png")),
     "a camera is missing": (listed_poses, ("extrinsics.json", "2 cameras", "has 1", "missing")),
     "video without its end": (
@@ -440,6 +440,10 @@ BOARDS: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a cut picture": (
         torn("calibration/right/00000.png", 0.7),
         ("calibration/right/00000.png", "cut off"),
+    ),
+    "pictures of another camera": (
+        lambda raw: (raw.folder / "calibration/right").rename(raw.folder / "calibration/b"),
+        ("calibration/right", "is missing", "first 2 frames"),
     ),
     "no pictures": (
         removed("calibration/left/00000.png"),

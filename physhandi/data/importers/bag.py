@@ -217,7 +217,7 @@ def _unpack(bag: Path, folder: Path, prefix: str, progress: Progress) -> None:
         with anyreader([bag], default_typestore=store) as reader:
             _unpack_open(bag, reader, folder, prefix, progress)
     except (import_module("rosbags.highlevel").AnyReaderError, OSError, ValueError) as error:
-        fail(bag, f"cannot be read as a bag ({error}); was its recording ended properly?")
+        fail(bag, f"cannot be read as a bag ({error}). Its recording may not have ended properly")
 
 
 def _unpack_open(bag: Path, reader: Any, folder: Path, prefix: str, progress: Progress) -> None:

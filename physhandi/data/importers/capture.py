@@ -422,6 +422,8 @@ def _unpacked(source: Path, out: Path, progress: Progress) -> Generator[Path, No
     try:
         unpack_bags(source, bags, folder, progress)
         yield folder
+    except ImportFailedError as error:  # Who has the bags knows nothing of that folder.
+        raise ImportFailedError(str(error).replace(str(folder), str(source))) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -709,7 +711,11 @@ def _sightings(
             sighting = find_board(one.color_image(frame), target)
             if sighting is not None:
                 return [sighting]
-        return [None]
+        fail(
+            folder,
+            f"is missing, and the first {count} frames of the view do not show the board. Put its "
+            "pictures there: folders of pictures are called as those of their cameras",
+        )
     sightings: list[BoardSighting | None] = []
     for path in files:
         image = one.rectifier.color(read_image(path, cv2.IMREAD_COLOR))

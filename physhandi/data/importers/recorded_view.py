@@ -104,9 +104,10 @@ def find_views(source: Path, intrinsics: Path | None = None) -> list[RecordedVie
         ImportFailedError: If there is no camera, or a file is missing or broken; names it.
     """
     if not source.is_dir():
+        lack = "is not a folder" if source.exists() else "does not exist"
         raise ImportFailedError(
-            f"{source} is not a folder. Give the folder of a recording (one folder for each "
-            "camera, with color and depth in it), a bag (.bag, .db3, .mcap) or .r3d."
+            f"{source} {lack}. Give the folder of a recording (one folder for each camera, with "
+            "color and depth in it), a bag (.bag, .db3, .mcap) or .r3d."
         )
     if (source / "metadata.json").is_file() and _numbered(source / "color"):
         return _phystwin_views(source)

@@ -273,6 +273,14 @@ def test_broken_bags_are_refused_and_named(tmp_path):
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag"] * 5
 
 
+def test_what_is_wrong_beside_a_bag_is_named_where_it_lies(tmp_path):
+    small_bag(tmp_path / "a.bag")
+    (tmp_path / "extrinsics.json").write_text("[]")
+    with pytest.raises(ImportFailedError) as refusal:
+        import_capture(tmp_path, tmp_path / "out")
+    assert str(refusal.value).startswith(f"{tmp_path}/extrinsics.json: has 0 cameras")
+
+
 class _Stops(Progress):
     def check_cancelled(self) -> None:
         raise CancelledError("stop")
