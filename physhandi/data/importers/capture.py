@@ -843,7 +843,8 @@ def _check_table(
         fail(
             source.view.folder if source.view.depth is None else source.view.depth.path,
             f"puts the table {ratio:.3g} times as far from the camera as the board says. The depth "
-            f"scale is not {source.scale:g}; {remedy}{other if is_lens else ''}",
+            f"scale is not {source.scale:g} ({remedy}), or the board is {ratio:.3g} times as large "
+            f"as was given (measure it){other if is_lens else ''}",
         )
     if not _RATIO[0] <= ratio <= _RATIO[1]:
         notes.append(
