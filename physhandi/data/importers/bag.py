@@ -23,7 +23,7 @@ from physhandi.data.importers.recorded_view import (
     CALIBRATION,
     LONGEST_NAME,
     camera_folders,
-    holds_streams,
+    has_streams,
 )
 from physhandi.data.untrusted.image_header import MOST_PIXELS
 from physhandi.data.untrusted.pickles import limit_data
@@ -78,7 +78,7 @@ def find_bags(source: Path) -> list[Path]:
     made of.
 
     Raises:
-        ImportFailedError: See `holds_streams`.
+        ImportFailedError: See `has_streams`.
     """
     if source.is_file():
         return [source] if source.suffix.lower() in BAG_SUFFIXES else []
@@ -89,8 +89,24 @@ def find_bags(source: Path) -> list[Path]:
     own = _bags_in(source)
     if own:
         return own
-    inner = [bag for folder in camera_folders(source) for bag in _bags_in(folder)]
-    return inner if inner and not holds_streams(source) else []
+    folders = camera_folders(source)
+    inner = [bag for folder in folders for bag in _bags_in(folder)]
+    return inner if inner and not any(map(has_streams, [source, *folders])) else []
+
+
+def left_out_bags(source: Path) -> list[str]:
+    """Say which bags are not read, though they alone are in a folder that may be a camera's."""
+    if not source.is_dir():
+        return []
+    read = find_bags(source)
+    what = "bags beside that folder" if read else "images of other cameras"
+    return [
+        f"{bag.relative_to(source)} is not read, because there are {what}."
+        for folder in camera_folders(source)
+        if folder not in read
+        for bag in _bags_in(folder)
+        if bag not in read and not has_streams(folder)
+    ]
 
 
 def _bags_in(folder: Path) -> list[Path]:

@@ -18,7 +18,7 @@ from physhandi.data import sequence as sequences
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.depth_scale import KNOWN_SCALES, LARGEST_SCALE
 from physhandi.data.files import temporary_name
-from physhandi.data.importers.bag import find_bags, name_bags, unpack_bags
+from physhandi.data.importers.bag import find_bags, left_out_bags, name_bags, unpack_bags
 from physhandi.data.importers.board_calibration import (
     AprilGrid,
     Board,
@@ -202,7 +202,7 @@ def import_capture(
         cameras = [one.camera(pose) for one, pose in zip(sources, placement.poses, strict=True)]
         report = dict(placement.report)
         report["agreement"] = _check_agreement(sources, cameras, placement, paired.count)
-        notes += [*paired.notes, *placement.notes]
+        notes += [*paired.notes, *placement.notes, *left_out_bags(given)]
         with SequenceWriter(out_folder, overwrite=overwrite, origin=origin) as writer:
             notes += _write(writer, sources, paired, progress)
             meta = SequenceMeta(
@@ -360,7 +360,7 @@ def _surveyed(source: Path, views: list[RecordedView], options: CaptureOptions) 
         _check_images(views, paired)
         sources, remarks = _sources(views, paired, options)
         scales = {one.view.name: one.scale for one in sources if one.view.depth is not None}
-        notes += [*remarks, *paired.notes]
+        notes += [*remarks, *paired.notes, *left_out_bags(source)]
     except (ImportFailedError, UsageError) as error:
         problems.append(str(error))
     try:

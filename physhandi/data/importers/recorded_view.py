@@ -147,13 +147,13 @@ def camera_folders(source: Path) -> list[Path]:
     ]
 
 
-def holds_streams(source: Path) -> bool:
-    """Tell whether a folder, or one in it, holds color or depth as images or a video.
+def has_streams(folder: Path) -> bool:
+    """Tell whether a folder holds color or depth of a camera as images or a video.
 
     Raises:
         ImportFailedError: See `find_views`.
     """
-    return any(_streams(folder, "") is not None for folder in [source, *camera_folders(source)])
+    return _streams(folder, "") is not None
 
 
 def _views_of(source: Path) -> list[_Folder]:

@@ -171,16 +171,19 @@ LAYOUTS: dict[str, tuple[str, dict[str, str]]] = {
         ".",
         {"left/1.mcap": "left_1", "left/2.mcap": "left_2", "right/1.mcap": "right"},
     ),
-    "an older one in a folder": (".", {"left.bag": "left", "right.bag": "right", "old/a.bag": "-"}),
+    "an older one in a folder": (".", {"left.bag": "left", "right.bag": "right", "old/a.bag": "?"}),
     "pictures of the board": (".", {"left.bag": "", "calibration/right.bag": "-"}),
     "ROS 2": (".", {"left/metadata.yaml": "left", "right/metadata.yaml": "right"}),
     "ROS 2 in the folder of its camera": (".", {"left/rec/metadata.yaml": "left"}),
     "images made of bags": (
         ".",
-        {"left/rec.bag": "-", "right/rec.bag": "-", "right/depth/0.npy": "-"},
+        {"left/rec.bag": "?", "right/rec.bag": "-", "right/depth/0.npy": "-"},
     ),
 }
-"""The source, and the files there with the name that each gives its camera (-: it is no bag)."""
+"""The source, and the files there with the name that each gives its camera.
+
+Those with - or ? are not read, and those with ? are told.
+"""
 
 
 @pytest.mark.parametrize("kind", LAYOUTS)
@@ -191,9 +194,11 @@ def test_cameras_are_called_after_their_bags_or_folders(tmp_path, kind):
         np.save(tmp_path / file, np.ones((2, 2))) if "npy" in file else (tmp_path / file).touch()
     bags = bag_reader.find_bags(tmp_path / source)
     places = {file.removesuffix("/metadata.yaml"): name for file, name in files.items()}
-    expected = {tmp_path / file: name for file, name in places.items() if name != "-"}
+    expected = {tmp_path / file: name for file, name in places.items() if name not in ("-", "?")}
     names = bag_reader.name_bags(tmp_path / source, bags)
     assert dict(zip(bags, names, strict=True)) == expected
+    told = [note.split()[0] for note in bag_reader.left_out_bags(tmp_path / source)]
+    assert told == [file for file, name in files.items() if name == "?"]
     if bags:
         found = [str(path.relative_to(tmp_path)) for path in bags]
         assert list(survey_capture(tmp_path / source).bags) == found

@@ -86,6 +86,8 @@ def long_capture(folder: Path, frames: int = 24, **options: bool) -> RawCapture:
 
 def test_a_lost_image_repeats_its_neighbour_and_lost_depth_is_empty(tmp_path):
     raw = long_capture(tmp_path / "raw")
+    (raw.folder / "other").mkdir()
+    (raw.folder / "other/rec.bag").touch()
     (raw.folder / "only/color/00007.png").unlink()
     (raw.folder / "only/depth/00012.png").unlink()
     sequence = import_capture(raw.folder, tmp_path / "out")
@@ -96,6 +98,9 @@ def test_a_lost_image_repeats_its_neighbour_and_lost_depth_is_empty(tmp_path):
     notes = sequence.provenance["notes"]
     assert "only/color has no image for frame 7; its neighbour is repeated." in notes
     assert "only/depth has no image for frame 12." in notes
+    left_out = "other/rec.bag is not read, because there are images of other cameras."
+    assert left_out in notes
+    assert left_out in survey_capture(raw.folder).notes
 
 
 def test_streams_are_paired_by_time_and_the_error_is_told(tmp_path):
