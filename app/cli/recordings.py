@@ -1,6 +1,7 @@
 """Commands that make, import and check sequences."""
 
 import shutil
+from collections.abc import Sequence as Many
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,6 +19,7 @@ from physhandi.fitting.config import HANDS, OBSERVATION
 from physhandi.progress import watched
 
 if TYPE_CHECKING:
+    from physhandi.data.importers.recorded_view import RecordedView
     from physhandi.fitting.checks.recording_check import RecordingCheck
 
 Hands = Annotated[Several[Literal["right", "left"]], arg(help_behavior_hint="(default: right)")]
@@ -524,6 +526,17 @@ def import_capture(
     clicks = [_click(text) for text in all_values(click)]
     if not clicks and (mask_model or track_model):
         raise UsageError("--mask-model and --track-model find what --click names; give that too.")
+
+    def check(cameras: "Many[RecordedView]", frame_count: int) -> None:
+        """Refuse clicks before minutes are spent on images."""
+        from physhandi.perception.segmentation import ShownView, check_clicks
+
+        views = {
+            camera.name: ShownView(camera.size, camera.color is not None, camera.depth is not None)
+            for camera in cameras
+        }
+        check_clicks(clicks, views, frame_count)
+
     with watched(True) as progress:
         sequence = convert(
             source,
@@ -532,6 +545,7 @@ def import_capture(
             options=options,
             overwrite=overwrite,
             keeps_same=bool(clicks) and _awaits_masks(out),
+            check=check,
         )
         if clicks:
             from physhandi.perception.annotation import annotate as find

@@ -104,7 +104,7 @@ def _check_place(out: Path, *, overwrite: bool) -> None:
     if not (out.exists() or out.is_symlink()):
         return
     if not overwrite:
-        raise UsageError(f"{out} exists already. Choose another folder, or allow overwriting.")
+        raise UsageError(f"{out} exists already. Choose another folder, or give --overwrite.")
     if out.is_symlink() or not (out / GALLERY_FILE).is_file():
         raise UsageError(f"{out} is no gallery and is not replaced. Choose another folder.")
 

@@ -111,7 +111,7 @@ def export(
     if out.suffix != suffix:
         raise UsageError(f"{out} does not end in '{suffix}', as a file of {options.format} does.")
     if out.is_dir() or (out.exists() and not options.overwrite):
-        raise UsageError(f"{out} exists already. Choose another path, or allow overwriting.")
+        raise UsageError(f"{out} exists already. Choose another path, or give --overwrite.")
     out.parent.mkdir(parents=True, exist_ok=True)
     make(order, out, report)
     return out

@@ -217,7 +217,7 @@ class SequenceWriter:
             return
         if not self._overwrite:
             raise SequenceError(
-                f"{self.folder} exists already. Choose another folder, or allow overwriting."
+                f"{self.folder} exists already. Choose another folder, or give --overwrite."
             )
         if not (self.folder / FILE).is_file():
             raise SequenceError(f"{self.folder} is not a sequence, so it is not overwritten.")

@@ -352,24 +352,34 @@ def _told(click: Click) -> str:
     return f"Click {click.view},{click.frame},{click.x:g},{click.y:g}"
 
 
-def _check_place(sequence: Sequence, click: Click) -> None:
+@dataclass(frozen=True)
+class ShownView:
+    """What a view has to click on."""
+
+    size: tuple[int, int]
+    """Width and height of its images [px]."""
+    has_color: bool
+    """Whether it has color images."""
+    has_depth: bool
+    """Whether it has depth images."""
+
+
+def _check_click(click: Click, views: Mapping[str, ShownView], frame_count: int) -> None:
     where = _told(click)
-    views = {view.name: view for view in sequence.views}
-    if click.view not in views:
+    view = views.get(click.view)
+    if view is None:
         names = ", ".join(views) or "none"
         raise UsageError(f"{where}: there is no view '{click.view}'. Views are: {names}.")
-    view = views[click.view]
     if not (view.has_color and view.has_depth):
         part = "depth" if view.has_color else "color"
         raise UsageError(
             f"{where}: view '{click.view}' has no {part}. Click in a view with color and depth."
         )
-    if not 0 <= click.frame < sequence.frame_count:
+    if not 0 <= click.frame < frame_count:
         raise UsageError(
-            f"{where}: there is no frame {click.frame}. Name one from 0 to "
-            f"{sequence.frame_count - 1}."
+            f"{where}: there is no frame {click.frame}. Name one from 0 to {frame_count - 1}."
         )
-    width, height = view.camera.width, view.camera.height
+    width, height = view.size
     if not (0 <= click.width <= 2 * width and 0 <= click.height <= 2 * height):
         raise UsageError(f"{where}: a box has a width and a height in pixels, both positive.")
     if not (-0.5 <= click.x <= width - 0.5 and -0.5 <= click.y <= height - 0.5):
@@ -378,14 +388,34 @@ def _check_place(sequence: Sequence, click: Click) -> None:
         )
 
 
-def check_places(sequence: Sequence, clicks: Many[Click]) -> None:
+def check_clicks(clicks: Many[Click], views: Mapping[str, ShownView], frame_count: int) -> None:
     """Refuse clicks where there is nothing to click on.
+
+    Args:
+        clicks: Places on the object.
+        views: The views of the recording, by name.
+        frame_count: Its frames.
 
     Raises:
         UsageError: If there is one.
     """
     for click in clicks:
-        _check_place(sequence, click)
+        _check_click(click, views, frame_count)
+
+
+def check_places(sequence: Sequence, clicks: Many[Click]) -> None:
+    """Refuse clicks where a sequence shows nothing to click on.
+
+    Raises:
+        UsageError: If there is one.
+    """
+    views = {
+        view.name: ShownView(
+            (view.camera.width, view.camera.height), view.has_color, view.has_depth
+        )
+        for view in sequence.views
+    }
+    check_clicks(clicks, views, sequence.frame_count)
 
 
 def detected_keypoints(

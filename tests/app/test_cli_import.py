@@ -1,5 +1,6 @@
 """The commands that turn other programs' files into ours."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -160,14 +161,27 @@ def test_a_click_with_the_import_makes_masks_and_tracks_at_once(tmp_path, capsys
         found = next(view for view in sequence.views if view.name == name).mask(2) == 1
         true = (picture(view, 2)[0] == [200, 60, 50]).all(axis=-1)
         assert (found & true).sum() > 0.85 * (found | true).sum()
-    code, _, error = call(capsys, *command, tmp_path / "other", "--click", "left,9,3,3")
-    assert code == 2
-    assert "there is no frame 9" in error
-    assert "click again with physhandi annotate" in error
-    assert Sequence.load(tmp_path / "other").missing("mask") == ["mask"]
-    code, _, error = call(capsys, *command, tmp_path / "third", "--click", "left,9")
-    assert code == 2
-    assert not (tmp_path / "third").exists()
+
+
+@pytest.mark.parametrize(
+    ("click", "words"),
+    [
+        ("left,3,3,3", "there is no frame 3. Name one from 0 to 2."),
+        ("top,0,3,3", "Views are: left, right."),
+        ("left,0,96,3", "x goes from 0 to 95, y to 71"),
+        ("right,0,3,3", "view 'right' has no depth"),
+        ("left,0", "does not name a place"),
+    ],
+)
+def test_a_click_where_nothing_can_be_is_refused_before_images_are_read(
+    tmp_path, capsys, click, words
+):
+    raw = RawCapture(tmp_path / "raw").write(3)
+    shutil.rmtree(raw.folder / "right" / "depth")
+    out = tmp_path / "ball"
+    code, _, error = call(capsys, "import", "capture", raw.folder, "--out", out, "--click", click)
+    assert (code, words in error) == (2, True), error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["raw"]
 
 
 KILLED_WHILE_IT_FINDS_MASKS = """
@@ -213,6 +227,7 @@ def test_a_click_beside_the_object_leaves_an_import_that_another_click_completes
     code, _, error = call(capsys, *command, "--click", "left,1,2,2")
     assert code == 2
     assert "left" in error
+    assert "click again with physhandi annotate" in error
     assert Sequence.load(tmp_path / "ball").missing("mask") == ["mask"]
     x, y = CAMERAS["left"].project(ball(1)[0]).round()
     code, out, error = call(capsys, *command, "--click", f"left,1,{x:g},{y:g}")

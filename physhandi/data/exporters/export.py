@@ -193,7 +193,7 @@ def _check_target(out: Path, suffix: str, *, is_folder: bool, overwrite: bool) -
     if not out.exists() or (is_folder and out.is_dir() and not any(out.iterdir())):
         return
     if not overwrite:
-        raise UsageError(f"{out} exists already. Choose another path, or allow overwriting.")
+        raise UsageError(f"{out} exists already. Choose another path, or give --overwrite.")
     if out.is_dir() != is_folder:
         kind = "folder" if out.is_dir() else "file"
         raise UsageError(f"{out} is a {kind}, which this export cannot replace. Choose another.")

@@ -2,7 +2,7 @@
 
 import hashlib
 import shutil
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -80,6 +80,8 @@ _LEAST_SHARED, _LEAST_SHARED_ABOVE = 0.45, 0.3
 _ABOVE = 0.02
 _ON_TABLE, _TABLE_POINTS = 0.015, 200
 _PNG_EFFORT = 2
+_MOST_RATE = 1000.0
+"""Most frames per second [Hz]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +156,7 @@ def import_capture(
     options: CaptureOptions | None = None,
     overwrite: bool = False,
     keeps_same: bool = False,
+    check: Callable[[Sequence[RecordedView], int], None] | None = None,
 ) -> sequences.Sequence:
     """Convert a raw recording of one or several RGB-D or color cameras into a sequence.
 
@@ -172,6 +175,8 @@ def import_capture(
         overwrite: Whether to replace a sequence that is there.
         keeps_same: Whether one that is there is taken as it is if it was made of the same recording
             with the same options; else it is refused like any other.
+        check: Is given the cameras and the number of frames before any image is imported, and may
+            refuse them by an error.
 
     Raises:
         ImportFailedError: If a file is missing, broken or contradicts another one; names it.
@@ -195,6 +200,8 @@ def import_capture(
         _check_images(views, paired)
         _check_board_pictures(source, views, _board(source, views, options))
         sources, notes = _sources(views, paired, options)
+        if check is not None:
+            check(views, paired.count)
         origin = _origin(source, given, sources, paired, options)
         if keeps_same and not overwrite and _is_made_of(Path(out_folder), origin):
             return sequences.Sequence.load(out_folder)
@@ -446,6 +453,11 @@ def _refuse_same_names(views: Sequence[RecordedView]) -> None:
 
 
 def _paired(views: Sequence[RecordedView], options: CaptureOptions) -> PairedFrames:
+    if options.frame_rate is not None and not 0.0 < options.frame_rate <= _MOST_RATE:
+        raise UsageError(
+            f"--frame-rate {options.frame_rate:g}: give frames per second, above 0 and up to "
+            f"{_MOST_RATE:g}."
+        )
     names = [f"{view.name}/{stream.kind}" for view in views for stream in view.streams]
     streams = [stream for view in views for stream in view.streams]
     paired = pair_streams(names, streams, options.frame_rate)

@@ -67,6 +67,11 @@ def test_frames_are_cut_and_thinned(raw, tmp_path):
         import_capture(raw.folder, tmp_path / "b", options=CaptureOptions(stop=7))
     with pytest.raises(UsageError, match="at least 2"):
         import_capture(raw.folder, tmp_path / "b", options=CaptureOptions(start=5))
+    for rate in (0.0, -30.0, float("nan"), 1e6):
+        options = CaptureOptions(frame_rate=rate)
+        with pytest.raises(UsageError, match="give frames per second"):
+            import_capture(raw.folder, tmp_path / "b", options=options)
+        assert "give frames per second" in survey_capture(raw.folder, options).problems[0]
     assert not (tmp_path / "b").exists()
 
 
