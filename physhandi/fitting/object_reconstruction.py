@@ -464,9 +464,9 @@ class CandidateEvaluator:
         """
         if not math.isfinite(result.loss_after):
             return result
-        found = result.loss_after, result.parameters
-        worse = [each for each in self._judged if each[0] >= found[0] and each[1] != found[1]]
-        for loss, parameters in (found, *sorted(worse, key=lambda each: each[0])):
+        best = result.loss_after, result.parameters
+        worse = [each for each in self._judged if each[0] >= best[0] and each[1] != best[1]]
+        for loss, parameters in (best, *sorted(worse, key=lambda each: each[0])):
             if self._holds_alone(parameters):
                 return replace(result, parameters=parameters, loss_after=loss)
         raise FitError(
