@@ -186,7 +186,11 @@ def read_pose(path: Path, value: Any, name: str) -> Float[ndarray, "4 4"]:
         rotation = next((fields[key] for key in ("rotation", "R") if key in fields), None)
         shift = next((fields[key] for key in ("translation", "t", "T") if key in fields), None)
         if rotation is None or shift is None:
-            fail(path, f"{name} needs rotation and translation, or 4x4 numbers")
+            listed = ", ".join(map(str, list(fields)[:12])) or "none"
+            fail(
+                path,
+                f"{name} needs rotation and translation, or 4x4 numbers. Its fields are {listed}",
+            )
         matrix = np.eye(4)
         matrix[:3, :3] = _numbers(path, f"{name}.rotation", rotation, 9).reshape(3, 3)
         matrix[:3, 3] = _numbers(path, f"{name}.translation", shift, 3)

@@ -478,6 +478,14 @@ def test_poses_may_stand_in_files_of_their_own(tmp_path, form):
         assert np.allclose(view.camera.K, CAMERAS[view.name].K)
 
 
+def test_poses_of_other_cameras_are_told_by_their_names(tmp_path):
+    raw = RawCapture(tmp_path / "raw", {"left": CAMERAS["left"]}).write(2, poses=False)
+    pose = CAMERAS["left"].T_world_camera.tolist()
+    (raw.folder / "extrinsics.json").write_text(json.dumps({"front": pose, "side": pose}))
+    with pytest.raises(ImportFailedError, match=r"extrinsics\.json: .* Its fields are front, side"):
+        import_capture(raw.folder, tmp_path / "out")
+
+
 def test_a_moved_camera_is_named(raw, tmp_path):
     pose = CAMERAS["right"].T_world_camera.copy()
     pose[2, 3] += 0.04
