@@ -230,7 +230,7 @@ for name in {simulated!r}:
     del sys.modules[name]
 import app.jobs.recordings.annotator
 """
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False
     )

@@ -28,7 +28,7 @@ from app.security import Security
 from app.server import create_app
 from app.slow_requests import ImpatientProtocol
 
-PAGE = Path(__file__).parents[2] / "docs/security.md"
+PAGE = Path(__file__).parents[3] / "docs/security.md"
 NAME = "physhandi.example"
 ORIGIN = f"https://{NAME}"
 NEEDED = [program for program in ("nginx", "openssl") if not shutil.which(program)]

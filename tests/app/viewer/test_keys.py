@@ -9,7 +9,7 @@ from support.server.server_world import World
 from app.keys import KEYS, key_of
 from app.viewer.color.quantities import QUANTITIES
 
-DOCS = Path(__file__).parents[2] / "docs" / "viewer.md"
+DOCS = Path(__file__).parents[3] / "docs" / "viewer.md"
 
 
 def test_the_documentation_lists_every_key_and_every_color() -> None:

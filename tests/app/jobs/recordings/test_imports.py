@@ -78,7 +78,7 @@ def test_the_operator_names_folders_that_are_there(data_dir: Path) -> None:
 
 @pytest.fixture
 def imports(settings: ServerSettings, monkeypatch: pytest.MonkeyPatch) -> Iterator[Imports]:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
     tasks = BackgroundTasks()
     yield Imports(settings, Catalog(settings), tasks, worker="support.server.import_worker")
     tasks.shutdown()

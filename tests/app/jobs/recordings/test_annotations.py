@@ -33,7 +33,7 @@ ADDRESS = "/api/v1/sequences/disc/annotation"
 def annotations(
     data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Annotations]:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
     catalog = Catalog(ServerSettings(data_dir=data_dir), bundled=tmp_path / "none")
     tasks = BackgroundTasks()
     models = ModelFolders(ServerSettings(data_dir=data_dir))

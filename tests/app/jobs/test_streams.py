@@ -43,7 +43,7 @@ class Stream:
 
 @pytest.fixture
 def world(data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[QueueWorld]:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     (tmp_path / "bundled").mkdir()
     with queue_world(data_dir, tmp_path / "bundled") as world:
         yield world

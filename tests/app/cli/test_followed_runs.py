@@ -32,7 +32,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch, data_dir: Path) -> Iterator[MadeClu
     """A cluster whose jobs are processes here, and commands that are told of it."""
     monkeypatch.setattr(ray_engine, "_INTERVAL_S", 0.0)
     monkeypatch.setattr(runs, "WORKER", WORKER)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     monkeypatch.setenv("PHYSHANDI_ENGINE_TOKEN", TOKEN)
     monkeypatch.setenv("PHYSHANDI_CLUSTER_PYTHON", sys.executable)
     monkeypatch.setenv("PHYSHANDI_DATA_DIR", str(data_dir))

@@ -29,7 +29,7 @@ from physhandi.data.run_folder import read_events
 from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
 from physhandi.run import Run
 
-TESTS = Path(__file__).parent.parent
+TESTS = Path(__file__).parents[2]
 GRACE_S = 0.4
 
 

@@ -82,7 +82,7 @@ def test_a_run_takes_what_all_its_processes_take(tmp_path: Path) -> None:
     environment = os.environ | {"PHYSHANDI_RUN": f"{tmp_path}:1"}
     command = [sys.executable, "-c", BUSY, str(tmp_path)]
     supervisor = subprocess.Popen(
-        command, stdout=subprocess.PIPE, env=environment, cwd=Path(__file__).parents[2]
+        command, stdout=subprocess.PIPE, env=environment, cwd=Path(__file__).parents[3]
     )
     try:
         assert supervisor.stdout is not None

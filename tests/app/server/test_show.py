@@ -11,7 +11,7 @@ from physhandi import viewer_process
 from physhandi.child import start_module
 from physhandi.errors import RunError
 
-BUNDLED = Path(__file__).parents[2] / "sequences" / "runs" / "towel_fold_quick"
+BUNDLED = Path(__file__).parents[3] / "sequences" / "runs" / "towel_fold_quick"
 
 
 @pytest.mark.slow
