@@ -34,7 +34,6 @@ def pytest_configure(config):
     os.fsync = lambda _descriptor: None
     # When all is over, nothing is gained by a search for garbage.
     atexit.register(gc.freeze)
-    jaxtyping.jaxtyped = _checked_at_times(jaxtyping.jaxtyped)
 
 
 def _checked_at_times(jaxtyped):
@@ -60,6 +59,10 @@ def _checked_at_times(jaxtyped):
         return call
 
     return decorator
+
+
+# Here, since fixtures of the folders below, which come before any hook, import what is checked.
+jaxtyping.jaxtyped = _checked_at_times(jaxtyping.jaxtyped)
 
 
 @pytest.hookimpl(wrapper=True)

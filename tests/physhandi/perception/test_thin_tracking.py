@@ -75,8 +75,11 @@ def film(
     for frame in range(FRAMES):
         material = np.linspace(*ends, 1500)
         line = path(material * (1 + stretched * frame / FRAMES) + frame * drawn)
-        distance, nearest = KDTree(line).query(np.stack([x, y], axis=-1))
-        nearest = material[nearest]
+        # Farther away none of the rope is in a pixel; to look for what is nearest takes long there.
+        distance, nearest = KDTree(line).query(
+            np.stack([x, y], axis=-1), distance_upper_bound=HALF_WIDTH + PIXEL
+        )
+        nearest = material[np.minimum(nearest, len(material) - 1)]
         share = np.clip((HALF_WIDTH - distance) / PIXEL + 0.5, 0, 1)
         paint = sum(
             np.sin(2 * np.pi * nearest / (PIXEL * (9 + 4 * n)) + phase)
