@@ -33,7 +33,7 @@ from physhandi.metrics.hands import evaluate_hands
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import NullProgress, Progress
 
-QUICK = HandFitConfig(iterations=160)
+QUICK = HandFitConfig(iterations=100)
 RECORDED = 40
 """Frames of the real recording that are used."""
 
@@ -83,7 +83,7 @@ def test_both_hands_and_the_scale_of_a_sequence_without_metres(tmp_path: Path) -
         cameras.append(type(camera).from_dict(fields))
     keypoint = scene.seen_keypoints(motions, cameras)
     sequence = scene.write_scene(tmp_path / "a", motions, cameras, keypoint, metric=False)
-    fit = reconstruct_hands(sequence, HandFitConfig(iterations=120))
+    fit = reconstruct_hands(sequence, HandFitConfig(iterations=90))
     assert [motion.side for motion in fit.motions] == ["right", "left"]
     for hand, truth in enumerate(motions):
         # A sequence without metres cannot tell a large hand from a small unit.
@@ -99,7 +99,7 @@ def test_a_view_that_errs_is_outvoted(tmp_path: Path) -> None:
     keypoint[1, 4:6, :, :, 0] += 60
     keypoint[2, 10, 0, 8:, 1] -= 45
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
-    fit = reconstruct_hands(sequence, HandFitConfig(iterations=140))
+    fit = reconstruct_hands(sequence, HandFitConfig(iterations=110))
     assert _vertex_error(fit, truth).max() < 0.005
 
 
@@ -144,12 +144,12 @@ def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_on
     truth = replace(scene.grasping(frames=4), scale=1.15)
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
-    config = HandFitConfig(iterations=60, depth_iterations=0, search_iterations=20)
+    config = HandFitConfig(iterations=45, depth_iterations=0, search_iterations=20)
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() > 0.05
     for is_new in (True, False):
         config = HandFitConfig(
-            iterations=60,
-            depth_iterations=60,
+            iterations=45,
+            depth_iterations=45,
             search_iterations=20,
             starts_at_depth=is_new,
             fixed_normals=is_new,

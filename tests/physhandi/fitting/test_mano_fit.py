@@ -34,7 +34,7 @@ def test_a_known_mano_hand_is_found_again(tmp_path: Path, mano: Path) -> None:
     truth = scene.grasping(side, model="mano")
     keypoint = scene.seen_keypoints([truth], CAMERAS)
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
-    fit = reconstruct_hands(sequence, HandFitConfig(model="mano", iterations=160))
+    fit = reconstruct_hands(sequence, HandFitConfig(model="mano", iterations=120))
     hand = load_hand_model(side, "mano")
     found, expected = fit.motions[0].vertices(hand), truth.vertices(hand)
     assert fit.motions[0].model == "mano"

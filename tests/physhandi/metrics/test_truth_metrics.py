@@ -60,20 +60,18 @@ def drawn_by_loops(vertex: np.ndarray, face: np.ndarray, fine: int = 12) -> tupl
 
 def distance_by_loops(point: np.ndarray, vertex: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Distance to the nearest triangle: to its plane where that is inside, else to an edge."""
-    found = []
-    for p in point:
-        nearest = np.inf
-        for triangle in vertex[face]:
-            a, b, c = triangle
-            share = np.linalg.lstsq(np.column_stack([b - a, c - a]), p - a, rcond=None)[0]
-            if min(*share, 1 - share.sum()) >= 0:
-                foot = a + share @ [b - a, c - a]
-                nearest = min(nearest, float(np.linalg.norm(p - foot)))
-            for start, end in ((a, b), (b, c), (c, a)):
-                along = np.clip((p - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
-                nearest = min(nearest, float(np.linalg.norm(p - start - along * (end - start))))
-        found.append(nearest)
-    return np.array(found)
+    nearest = np.full(len(point), np.inf)
+    for a, b, c in vertex[face]:
+        side = np.stack([b - a, c - a])
+        share = np.linalg.lstsq(side.T, (point - a).T, rcond=None)[0].T
+        gap = np.linalg.norm(point - a - share @ side, axis=1)
+        is_inside = (share >= 0).all(axis=1) & (share.sum(axis=1) <= 1)
+        nearest[is_inside] = np.minimum(nearest, gap)[is_inside]
+        for start, end in ((a, b), (b, c), (c, a)):
+            along = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+            gap = np.linalg.norm(point - start - along[:, None] * (end - start), axis=1)
+            nearest = np.minimum(nearest, gap)
+    return nearest
 
 
 def test_a_node_above_the_middle_of_a_square() -> None:
