@@ -22,6 +22,7 @@ from support.inputs.raw_capture import (
     FRAMES,
     RawCapture,
     camera_at,
+    find_no_hand,
     intrinsics,
     picture,
 )
@@ -31,6 +32,7 @@ from physhandi.data.importers import recorded_stream
 from physhandi.data.importers.capture import CaptureOptions, import_capture, survey_capture
 from physhandi.data.untrusted.media import MediaDecoder
 from physhandi.errors import PhysHandiError, UsageError
+from physhandi.perception import segmentation
 from physhandi.perception.annotation import annotate
 from physhandi.perception.segmentation import Click
 
@@ -541,7 +543,8 @@ def test_broken_images_that_are_not_imported_do_no_harm(tmp_path):
 
 
 @pytest.mark.parametrize("place", [(2, 2), (48, 66), (90, 20)])
-def test_a_click_beside_the_object_gives_no_empty_masks(tmp_path, place):
+def test_a_click_beside_the_object_gives_no_empty_masks(tmp_path, monkeypatch, place):
+    monkeypatch.setattr(segmentation, "detect_view", find_no_hand)
     raw = RawCapture(tmp_path / "raw").write(3)
     sequence = import_capture(raw.folder, tmp_path / "out")
     before = {path: path.stat().st_mtime_ns for path in sequence.folder.rglob("*")}

@@ -1,5 +1,6 @@
 """The commands that turn other programs' files into ours."""
 
+import re
 import shutil
 import signal
 import subprocess
@@ -11,11 +12,12 @@ from support.inputs.clicked_disc import write_disc
 from support.inputs.mano_file import write_mano
 from support.inputs.phystwin_case import write_case
 from support.inputs.phystwin_experiment import write_experiment
-from support.inputs.raw_capture import CAMERAS, RawCapture, ball, picture
+from support.inputs.raw_capture import CAMERAS, RawCapture, ball, find_no_hand, picture
 
 from app import cli
 from physhandi.data.sequence import Sequence
 from physhandi.hand.loading import load_hand_model
+from physhandi.perception import segmentation
 from physhandi.run import Run
 
 
@@ -152,6 +154,7 @@ def test_a_click_with_the_import_makes_masks_and_tracks_at_once(tmp_path, capsys
     code, out, error = call(capsys, *command, tmp_path / "ball", "--click", f"left,1,{x:g},{y:g}")
     assert code == 0, error
     assert "frames with object: 3" in out
+    assert re.search(r"frames with hands: 0\b", out)  # So `find_no_hand` tells the truth.
     sequence = Sequence.load(tmp_path / "ball")
     sequence.validate()
     assert sequence.missing("mask", "track") == []
@@ -193,7 +196,8 @@ cli.main(sys.argv[1:])
 """
 
 
-def test_an_import_that_was_killed_while_it_found_masks_goes_on(tmp_path, capsys):
+def test_an_import_that_was_killed_while_it_found_masks_goes_on(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(segmentation, "detect_view", find_no_hand)
     raw = RawCapture(tmp_path / "raw").write(3)
     x, y = CAMERAS["left"].project(ball(1)[0]).round()
     command = ("import", "capture", raw.folder, "--out", tmp_path / "ball")
@@ -221,7 +225,10 @@ def test_an_import_that_was_killed_while_it_found_masks_goes_on(tmp_path, capsys
     assert (code, "exists already" in error) == (1, True)
 
 
-def test_a_click_beside_the_object_leaves_an_import_that_another_click_completes(tmp_path, capsys):
+def test_a_click_beside_the_object_leaves_an_import_that_another_click_completes(
+    tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(segmentation, "detect_view", find_no_hand)
     raw = RawCapture(tmp_path / "raw").write(3)
     command = ("import", "capture", raw.folder, "--out", tmp_path / "ball")
     code, _, error = call(capsys, *command, "--click", "left,1,2,2")

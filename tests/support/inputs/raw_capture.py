@@ -10,6 +10,8 @@ from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers.board_calibration import CharucoTarget
+from physhandi.data.view import View
+from physhandi.hand.names import HandSide
 from physhandi.synthetic.raw_capture import photograph_board
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
@@ -52,6 +54,11 @@ def rays(camera: PinholeCamera) -> tuple[ndarray, ndarray]:
     pixel = np.stack([x, y], axis=-1).astype(float)
     eye = camera.T_world_camera[:3, 3]
     return eye, camera.unproject(pixel, np.ones(pixel.shape[:2])) - eye
+
+
+def find_no_hand(view: View, hands: tuple[HandSide, ...], *_: object) -> np.ndarray:
+    """Tell of a view what the networks of `detect_view` tell, which take a second for that."""
+    return np.full((view.frame_count, len(hands), 21, 3), np.nan, dtype=np.float32)
 
 
 def picture(camera: PinholeCamera, frame: int) -> tuple[ndarray, ndarray]:
