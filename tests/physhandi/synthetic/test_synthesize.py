@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from support.physics.synthetic_world import hand_pose
 
 from app import cli
 from physhandi.data.sequence import Sequence
@@ -15,6 +16,9 @@ from physhandi.perception.lifting import observe_object
 from physhandi.perception.shape import shape_of_observation
 from physhandi.progress import Progress
 from physhandi.synthetic import synthesize as generator
+from physhandi.synthetic.bodies.bodies import Body
+from physhandi.synthetic.engines.truth import PhysicalTruth
+from physhandi.synthetic.hands.true_hand import load_true_hand
 from physhandi.synthetic.synthesize import synthesize
 
 pytest.importorskip("mujoco")
@@ -49,7 +53,20 @@ def test_what_is_seen_is_near_what_happened(rope):
     assert 30 < len(node) < 400
 
 
-def test_actions_share_a_seed_s_body_but_not_its_cameras(rope, tmp_path):
+def lying(body: Body, _scripts: Any, hands: Any, *, frame_count: int, **_how: Any) -> PhysicalTruth:
+    """What MuJoCo would tell if the hands kept away and the body lay still."""
+    far = {side: load_true_hand(side).bone_transforms(hand_pose(0.4, 0.2)) for side in hands}
+    return PhysicalTruth(
+        body=body,
+        position=np.repeat(body.node[None], frame_count, axis=0).astype(np.float32),
+        contact=np.zeros((frame_count, len(body.node)), dtype=bool),
+        hold="friction",
+        hands={side: np.repeat(bones[None], frame_count, axis=0) for side, bones in far.items()},
+    )
+
+
+def test_actions_share_a_seed_s_body_but_not_its_cameras(rope, tmp_path, monkeypatch):
+    monkeypatch.setattr(generator, "simulate_truth", lying)
     changes = {"depth_noise": 0.05, "track_noise": 0.5}
     lift = synthesize(
         *("rope", "lift"),
