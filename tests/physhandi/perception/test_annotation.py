@@ -1,6 +1,6 @@
 import hashlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -180,6 +180,17 @@ class _Killed(BaseException):
     """Stands for the end of a process: nothing is cleared away after it."""
 
 
+def once(find: Callable[..., object]) -> Callable[..., object]:
+    """Let a function find something the first time, and give it again whatever is asked then."""
+    found: list[object] = []
+
+    def call(*asked: object) -> object:
+        found.extend([] if found else [find(*asked)])
+        return found[0]
+
+    return call
+
+
 @pytest.fixture
 def whole_test() -> Iterator[pytest.MonkeyPatch]:
     """Patches that stay when those of `monkeypatch` are undone midway."""
@@ -195,11 +206,7 @@ def test_masks_and_tracks_can_be_made_again_wherever_their_storing_ended(
     if not clicks:  # Tracks are there that are to go.
         annotate(sequence.folder, [Click(*disc_click())])
     stored = iter(range(100))
-    moves, segment, masks = Path.rename, annotation.segment, []
-
-    def segment_once(*asked: object) -> object:
-        masks.extend([] if masks else [segment(*asked)])
-        return masks[0]
+    moves = Path.rename
 
     def killed_at(last: int) -> None:
         def rename(path: Path, target: Path) -> Path:
@@ -211,7 +218,8 @@ def test_masks_and_tracks_can_be_made_again_wherever_their_storing_ended(
         monkeypatch.setattr(annotation.shutil, "rmtree", lambda *_, **__: None)
 
     # What is found is the same each time, and most of the work.
-    whole_test.setattr(annotation, "segment", segment_once)
+    for finder in ("segment", "track_points"):
+        whole_test.setattr(annotation, finder, once(getattr(annotation, finder)))
     ends = 0
     for last in range(20):
         folder = Path(shutil.copytree(sequence.folder, tmp_path / f"copy{last}"))
