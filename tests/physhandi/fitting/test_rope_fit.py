@@ -150,7 +150,7 @@ def test_a_stopped_fit_of_a_rope_goes_on_to_the_same_bits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     write_always(monkeypatch)
-    problem = problem_of(swung_rope(60.0, 12.0, 0.03).track[:24].double().numpy(), 60.0)
+    problem = problem_of(swung_rope(60.0, 12.0, 0.03).track[:12].double().numpy(), 60.0)
     config = CONFIG.object_.replace(rope_steps=2)
 
     def fit(progress: Progress, checkpointer: Checkpointer | None) -> FirstOrderResult:
