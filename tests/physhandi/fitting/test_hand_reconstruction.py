@@ -144,12 +144,12 @@ def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_on
     truth = replace(scene.grasping(frames=4), scale=1.15)
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
-    config = HandFitConfig(iterations=45, depth_iterations=0, search_iterations=20)
+    config = HandFitConfig(iterations=60, depth_iterations=0, search_iterations=20)
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() > 0.05
     for is_new in (True, False):
         config = HandFitConfig(
-            iterations=45,
-            depth_iterations=45,
+            iterations=60,
+            depth_iterations=60,
             search_iterations=20,
             starts_at_depth=is_new,
             fixed_normals=is_new,
