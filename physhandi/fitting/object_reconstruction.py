@@ -111,7 +111,7 @@ def search_object(
     try:
         result = search_parameters(evaluate, start, search, progress)
     except FitError:
-        if not evaluate.failures[_DIVERGED]:
+        if evaluate.failures and not evaluate.failures[_DIVERGED]:
             raise FitError(evaluate.explain_failures()) from None
         if start.speed_limit >= CATCHING_SPEED:
             raise
