@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+_NO_LENGTH = 1e-12
+"""Vectors shorter than this have no direction."""
 _LINE = 1e-9
 """Ratio of squares of extents below which points are on a line but for rounding."""
 _POINT = 1e-18
@@ -15,6 +17,11 @@ _NEWTON_STEPS = 12
 _DOUBTFUL, _CONVERGED = 1e-3, 1e-12
 """Rotations are decomposed one by one below this product of the sums of two singular values each,
 or sum of the squares of their products, and above this last step, with a norm of 1."""
+
+
+def unit(vector: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 3"]:
+    """Give unit vectors; a vector without a length stays zero."""
+    return vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), _NO_LENGTH)
 
 
 def unit_across(

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.rotations import unit
+
 _UNDISTORT_ITERATIONS = 30
 _MIN_ANGLE = np.deg2rad(3)
 _FIELDS = ("K", "T_world_camera", "width", "height", "distortion")
@@ -246,8 +248,7 @@ def _widest_angle(
     is_seen: ndarray,
 ) -> Float[ndarray, " point"]:
     """Compute the largest angle between the rays on which a point is seen [rad]."""
-    rays = np.stack([point - camera.T_world_camera[:3, 3] for camera in cameras])
-    rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
+    rays = unit(np.stack([point - camera.T_world_camera[:3, 3] for camera in cameras]))
     widest = np.zeros(point.shape[0])
     for first in range(len(cameras)):
         for second in range(first):

@@ -16,7 +16,10 @@ FORMAT = "physhandi-sequence/1"
 UNFINISHED = "unfinished"
 """Provenance field of masks that are being stored."""
 FILE = "sequence.yaml"
-SAFE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+LONGEST_NAME = 64
+"""Letters of the longest name of a sequence, a view or a hand."""
+SAFE_NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{LONGEST_NAME}}}")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
 _SIZE_LIMIT = 4_000_000
 _MOST_FRAMES = 1_000_000
 
@@ -114,6 +117,11 @@ class SequenceMeta:
             **({} if self.shape is None else {"shape": self.shape}),
             **({} if self.mass is None else {"mass": self.mass}),
         }
+
+
+def safe_name(name: str, longest: int = LONGEST_NAME) -> str:
+    """Give a name that a folder may have: other letters become _, and the first ones count."""
+    return _UNSAFE.sub("_", name)[:longest]
 
 
 def default_reconstruction_count(frame_count: int) -> int:

@@ -29,6 +29,7 @@ from physhandi.perception.shape_class import (
     poisson_disk_points,
     rim_points,
 )
+from physhandi.rotations import unit
 from physhandi.triangles import SurfaceSamples
 from physhandi.unique_rows import unique_rows
 
@@ -114,8 +115,7 @@ def _sheet_basis(
     flat = np.stack([local @ first, local @ second], axis=1)
     corners = cv2.boxPoints(cv2.minAreaRect((flat * 1000).astype(np.float32)))
     sides = np.diff(corners[:3], axis=0)
-    long = sides[int(np.argmax(np.linalg.norm(sides, axis=1)))].astype(np.float64)
-    long /= max(float(np.linalg.norm(long)), 1e-12)
+    long = unit(sides[int(np.argmax(np.linalg.norm(sides, axis=1)))].astype(np.float64))
     long = long if long[np.argmax(np.abs(long))] > 0 else -long
     length = long[0] * first + long[1] * second
     return np.stack([length, np.cross(normal, length), normal])
@@ -196,8 +196,7 @@ def surface_nodes(
     if len(order) == 0:
         return node
     ends = normal[pair[owner[order]]]
-    along = ends[:, 0] + ends[:, 1] * np.sign((ends[:, :1] * ends[:, 1:]).sum(axis=2))
-    along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
+    along = unit(ends[:, 0] + ends[:, 1] * np.sign((ends[:, :1] * ends[:, 1:]).sum(axis=2)))
     return np.concatenate([node, _filling(node, bridges[order], along, spacing)])
 
 

@@ -27,6 +27,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import KDTree
 
 from physhandi.data.sequence_meta import ShapeClass
+from physhandi.rotations import unit
 from physhandi.unique_rows import unique_rows
 
 HiddenTest = Callable[[Float[ndarray, "point 3"]], Bool[ndarray, " point"]]
@@ -253,8 +254,7 @@ def _slices(
     middle = {n: point[number == n].mean(axis=0) for n in np.unique(number)}
     sizes: list[tuple[float, float]] = []
     for n, center in middle.items():
-        run = middle.get(n + 1, center) - middle.get(n - 1, center)
-        run = run / max(float(np.linalg.norm(run)), 1e-12)
+        run = unit(middle.get(n + 1, center) - middle.get(n - 1, center))
         around = point[number == n] - center
         across = around - np.outer(around @ run, run)
         sides = np.sort(np.linalg.svd(across, full_matrices=False)[1])[::-1]

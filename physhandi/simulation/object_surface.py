@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
 
-from physhandi.rotations import parallel_transport, smallest_rotations
+from physhandi.rotations import parallel_transport, smallest_rotations, unit
 from physhandi.simulation.surface import is_line, triangulate_nodes, typical_distance
 from physhandi.unique_rows import unique_rows
 
@@ -120,8 +120,7 @@ class Tube:
         """Find where the curve heads at each ring; the rings of an end share its last point."""
         count = len(_ROUND_END) + 1
         inner = curve[count:-count]
-        ahead = np.gradient(inner, axis=0)
-        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+        ahead = unit(np.gradient(inner, axis=0))
         return np.concatenate([ahead[:1]] * count + [ahead] + [ahead[-1:]] * count)
 
 
@@ -255,8 +254,7 @@ def _corners(
     is_corner = np.zeros(len(point), bool)
     vertex, first, count = np.unique(start, return_index=True, return_counts=True)
     first, vertex = first[count == 2], vertex[count == 2]
-    arms = point[np.stack([end[first], end[first + 1]], axis=1)] - point[vertex, None]
-    arms /= np.maximum(np.linalg.norm(arms, axis=2, keepdims=True), 1e-12)
+    arms = unit(point[np.stack([end[first], end[first + 1]], axis=1)] - point[vertex, None])
     is_corner[vertex] = np.sum(arms[:, 0] * arms[:, 1], axis=1) > _CORNER
     return is_corner
 
@@ -322,8 +320,7 @@ def _tube_round(
     beyond, wide = np.concatenate([[[1.0, 0.0]], _ROUND_END]).T
     along = np.concatenate([-beyond, np.zeros(count), beyond[::-1]])
     shape = np.concatenate([wide, np.ones(count), wide[::-1]])
-    direction = station[1] @ point - station[0] @ point
-    direction /= max(float(np.linalg.norm(direction)), 1e-12)
+    direction = unit(station[1] @ point - station[0] @ point)
     across = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     across /= np.linalg.norm(across)
     return ObjectSurface(

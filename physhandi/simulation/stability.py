@@ -10,6 +10,7 @@ from numpy import ndarray
 from scipy.linalg import eigh_tridiagonal
 from scipy.sparse import csr_array, vstack
 
+from physhandi.rotations import unit
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.rod import Rod
@@ -295,8 +296,3 @@ def _length(value: ndarray) -> float:
 def _coordinates(node: ndarray) -> ndarray:
     """Return where the three coordinates of nodes are in a flat motion."""
     return (3 * node[..., None] + np.arange(3)).ravel()
-
-
-def unit(offset: Float[ndarray, "spring 3"]) -> Float[ndarray, "spring 3"]:
-    """Return directions; zero of springs without a length."""
-    return offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physhandi.rotations import best_rotations
+from physhandi.rotations import best_rotations, unit
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-6, 1e-12])
@@ -51,3 +51,9 @@ def test_points_that_leave_a_line_turn_about_it_little_by_little() -> None:
     assert angle[1] == pytest.approx(np.degrees(np.arctan2(0.004, 0.012)), rel=0.01)
     assert angle[1] < angle[2] < angle[3]
     assert angle[3] == pytest.approx(90.0)
+
+
+def test_a_vector_without_a_length_stays_zero_among_unit_vectors() -> None:
+    assert unit(np.array([[3.0, 0, 4], [0, 0, 0], [0, -2, 0]])) == pytest.approx(
+        np.array([[0.6, 0, 0.8], [0, 0, 0], [0, -1, 0]])
+    )

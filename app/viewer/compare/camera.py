@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.content.session_state import Pose
+from physhandi.rotations import unit
 
 PICTURE_WIDTH = 1_600
 """Width of an exported picture of both sides [px]."""
@@ -38,10 +39,8 @@ class Eye:
     def at(cls, pose: Pose) -> "Eye":
         """Find the orientation of a camera that looks at a point."""
         ahead = pose.look_at - pose.position
-        right = np.cross(ahead, pose.up)
-        right = right / max(float(np.linalg.norm(right)), 1e-12)
-        up = np.cross(right, ahead)
-        return cls(right=right, up=up / max(float(np.linalg.norm(up)), 1e-12))
+        right = unit(np.cross(ahead, pose.up))
+        return cls(right=right, up=unit(np.cross(right, ahead)))
 
     @property
     def ahead(self) -> Float[ndarray, " 3"]:

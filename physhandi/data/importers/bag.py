@@ -21,10 +21,10 @@ from physhandi.data.importers.phystwin_files import fail
 from physhandi.data.importers.record3d import RECORD3D_SUFFIX, unpack_record3d
 from physhandi.data.importers.recorded_view import (
     CALIBRATION,
-    LONGEST_NAME,
     camera_folders,
     has_streams,
 )
+from physhandi.data.sequence_meta import LONGEST_NAME, safe_name
 from physhandi.data.untrusted.image_header import MOST_PIXELS
 from physhandi.data.untrusted.pickles import limit_data
 from physhandi.errors import UsageError
@@ -135,11 +135,12 @@ def name_bags(source: Path, bags: list[Path]) -> list[str]:
         else:
             is_alone = folders.count(bag.parent) == 1
             name = bag.parent.name if is_alone else f"{bag.parent.name}_{bag.stem}"
-        other = named.setdefault(_safe(name), bag)
+        safe = safe_name(name, _LONGEST_NAME)
+        other = named.setdefault(safe, bag)
         if other is not bag:
             fail(
                 bag,
-                f"names its camera '{_safe(name)}', as {other} does. Name each after its camera "
+                f"names its camera '{safe}', as {other} does. Name each after its camera "
                 f"(the first {_LONGEST_NAME} letters, digits, - and _ count), and keep one if both "
                 "are one recording",
             )
@@ -311,11 +312,8 @@ def _camera_name(topic: str) -> str:
         if kind.search(part):
             break
         before.append(part)
-    return _safe("_".join(part for part in before if not part.startswith("sensor_")))
-
-
-def _safe(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", name)[:_LONGEST_NAME]
+    name = "_".join(part for part in before if not part.startswith("sensor_"))
+    return safe_name(name, _LONGEST_NAME)
 
 
 def _info(reader: Any, infos: Mapping[str, Any], topic: str) -> Any:

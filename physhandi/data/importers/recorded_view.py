@@ -29,13 +29,11 @@ from physhandi.data.importers.recorded_stream import (
     read_times,
     video_stream,
 )
-from physhandi.data.sequence_meta import SAFE_NAME
+from physhandi.data.sequence_meta import safe_name
 from physhandi.errors import ImportFailedError
 
 CALIBRATION = "calibration"
 """Folder of the pictures of the board, one folder a view."""
-LONGEST_NAME = 64
-"""Letters of a folder's name that count for its view."""
 _TABLES = (".json", ".yaml", ".yml")
 _INTRINSICS = (
     *("intrinsics", "color_intrinsics", "rgb_intrinsics", "camera_intrinsic", "camera_info"),
@@ -162,12 +160,12 @@ def _views_of(source: Path) -> list[_Folder]:
         return [own]
     folders: list[_Folder] = []
     for folder in camera_folders(source):
-        streams = _streams(folder, _safe_name(folder.name, len(folders)))
+        streams = _streams(folder, _view_name(folder, len(folders)))
         if streams is None:
             images = [path for path in folder.iterdir() if path.suffix.lower() in COLOR_SUFFIXES]
             if images:
                 color = image_stream("color", folder, images)
-                streams = _Folder(_safe_name(folder.name, len(folders)), folder, color, None)
+                streams = _Folder(_view_name(folder, len(folders)), folder, color, None)
         if streams is not None:
             folders.append(streams)
     return folders
@@ -178,8 +176,8 @@ def _streams(folder: Path, name: str) -> _Folder | None:
     return None if color is None and depth is None else _Folder(name, folder, color, depth)
 
 
-def _safe_name(name: str, number: int) -> str:
-    safe = "".join(c if SAFE_NAME.fullmatch(c) else "_" for c in name)[:LONGEST_NAME]
+def _view_name(folder: Path, number: int) -> str:
+    safe = safe_name(folder.name)
     return safe if safe.strip("_") else f"view{number}"
 
 

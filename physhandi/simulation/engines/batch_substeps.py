@@ -6,10 +6,11 @@ import numpy as np
 import warp as wp
 from numpy import ndarray
 
+from physhandi.rotations import unit
 from physhandi.simulation.kernels.batch.loads import find_loads
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.stability import SAFETY, critical_step, substeps_of, unit
+from physhandi.simulation.stability import SAFETY, critical_step, substeps_of
 from physhandi.simulation.topology import virtual_floor
 
 
