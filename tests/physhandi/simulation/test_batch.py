@@ -235,6 +235,25 @@ def test_a_candidate_that_diverges_does_not_harm_the_others(device, way):
         np.testing.assert_allclose(moved.position[candidate], wanted, atol=2e-6)
 
 
+@pytest.mark.parametrize("way", WAYS)
+def test_each_candidate_has_its_own_speed_limit(device, way):
+    if device == "cpu" and way != "side by side":
+        pytest.skip("candidates on a CPU take turns either way")
+    node, control, velocity = scene()
+    drawn = candidates(5)
+    master = master_of(node, control, drawn, velocity)
+    moved = simulator_of(way, master, drawn, device).rollout(control)
+    # The mean over a frame: some substep exceeds half of it, and none ten times as much.
+    speed = 30.0 * np.linalg.norm(np.diff(moved.position, axis=1), axis=-1).max(axis=(1, 2))
+    assert np.all(speed > 0.1)
+    limits = speed * [10.0, 0.5, 100.0, 0.2, 1000.0]
+    drawn = [p.replace(speed_limit=float(s)) for p, s in zip(drawn, limits, strict=True)]
+    again = simulator_of(way, master, drawn, device).rollout(control)
+    assert np.array_equal(again.diverged_frame >= 0, [False, True, False, True, False])
+    slow = [0, 2, 4]
+    np.testing.assert_array_equal(again.position[slow], moved.position[slow])
+
+
 def test_what_must_be_common_and_what_a_batch_cannot_do_are_refused():
     node, control, _ = scene(3)
     master = MasterTopology.of(node, control[0], [BASE])
