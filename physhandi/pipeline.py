@@ -5,6 +5,7 @@ works, so that an interrupted run goes on where it was.
 """
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Many
 from functools import cache, partial
@@ -29,6 +30,7 @@ from physhandi.data.layout import (
     SEARCH_FILE,
     SHAPE_FILE,
     SPLATS_FILE,
+    STEADINESS_FILE,
     SequenceFiles,
 )
 from physhandi.data.observation import ObjectObservation
@@ -78,7 +80,7 @@ from physhandi.fitting.placement import (
 )
 from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.rope.fit import fit_rope, start_rope
-from physhandi.fitting.spring_optimisation import optimise_springs
+from physhandi.fitting.spring_optimisation import NUDGE, STEADY, fit_steady_springs
 from physhandi.fitting.steered_run import (
     contacts_from,
     contacts_in,
@@ -653,7 +655,12 @@ def _stage_search(
         )
     attempt.save_yaml(PARAMETERS_FILE, result.parameters.to_dict())
     searched = {name: variable.to_dict() for name, variable in result.intervals.items()}
-    attempt.save_yaml(SEARCH_FILE, {"intervals": searched, "widened": list(result.widened)})
+    about_search = {
+        "intervals": searched,
+        "widened": list(result.widened),
+        "runners_up": [parameters.to_dict() for parameters in result.runners_up],
+    }
+    attempt.save_yaml(SEARCH_FILE, about_search)
     losses = [result.loss_before], [result.loss_after]
     _finish(attempt, SEARCH, *losses, result.curve, note=result.note)
 
@@ -675,14 +682,16 @@ def _stage_springs(
     if is_rod:
         result = fit_rope(problems(), parameters, config.object_, progress, checkpointer=keeper())
     else:
-        result = optimise_springs(
+        result = fit_steady_springs(
             problems(),
-            parameters,
+            [parameters, *artefacts.load_runners_up(attempt.out)],
             config.object_,
             progress,
             device=device,
             checkpointer=keeper(),
         )
+        sway = result.sway if math.isfinite(result.sway) else None
+        attempt.save_yaml(STEADINESS_FILE, {"nudge": NUDGE, "limit": STEADY, "sway": sway})
     for problem in problems():
         artefacts.save_model(attempt, problem.name, result.models[problem.name])
         if problem.contacts is not None:
@@ -691,7 +700,7 @@ def _stage_springs(
     first = problems()[0]
     artefacts.save_object(attempt, result.parameters, result.models[first.name], first.rest_node)
     losses = [result.loss_before], [result.loss_after]
-    _finish(attempt, SPRINGS, *losses, result.curve, note=result.stopped)
+    _finish(attempt, SPRINGS, *losses, result.curve, note=result.note)
 
 
 def _stage_refinement(

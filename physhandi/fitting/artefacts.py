@@ -19,6 +19,7 @@ from physhandi.data.files import named_fields, parse_yaml
 from physhandi.data.layout import (
     MATERIAL_FILE,
     PARAMETERS_FILE,
+    SEARCH_FILE,
     SHAPE_FILE,
     SPLATS_FILE,
     SequenceFiles,
@@ -260,6 +261,16 @@ def load_parameters(out: Path) -> SimulationParameters:
         if content is None:
             raise ValueError("it must hold named fields")
         return SimulationParameters.from_dict(content)
+
+
+def load_runners_up(out: Path) -> list[SimulationParameters]:
+    """Read the next best parameters of a run's search; none in runs of earlier versions."""
+    path = out / SEARCH_FILE
+    if not path.is_file():
+        return []
+    with reading(path):
+        content = named_fields(parse_yaml(path.read_text(encoding="utf-8"))) or {}
+        return [SimulationParameters.from_dict(each) for each in content.get("runners_up") or ()]
 
 
 def load_shape(out: Path) -> tuple[ShapeClass, float]:

@@ -232,6 +232,9 @@ class FirstOrderConfig(Settings, frozen=True, kw_only=True):
     """Whether iterations are ranked by the loss met on the way, while the springs still changed
     after every window (PhysTwin), or by simulating once more with the springs at their end. Ranked
     on the way, the start is no candidate."""
+    most_starts: Annotated[int, Meta(ge=1, le=100)] = 1
+    """Candidates of the search that springs may be fitted from, the best first. The next one has
+    its turn where the fitted motion is unsteady: 1 % of stiffness moves it elsewhere."""
 
 
 class CudaConfig(Settings, frozen=True, kw_only=True):

@@ -57,6 +57,9 @@ _DIGEST = 16
 """Bytes by which a candidate is told from others."""
 _DIVERGED, _TOO_FINE, _LOOSE = "diverged", "too fine", "loose"
 """Why a candidate cannot be simulated."""
+_OTHER_RADIUS, _LITTLE_WORSE = 1.1, 1.25
+"""Ratio of connection radii from which candidates have other springs, and of the losses of a
+runner-up and the best candidate at most."""
 CATCHING_SPEED = 1000.0
 """Speed from which nodes count as diverged where all candidates exceed the usual one [m/s]. Springs
 of millimetres that take hold of a node centimetres away move it at 200 m/s, and are stable."""
@@ -117,8 +120,10 @@ def search_object(
             raise
         start = start.replace(speed_limit=CATCHING_SPEED)
         result = search_parameters(evaluate, start, search, progress)
-    is_batched = wp.get_device(device).is_cuda
-    return evaluate.best_that_holds(result) if is_batched else result
+    if wp.get_device(device).is_cuda:
+        result = evaluate.best_that_holds(result)
+    most = config.first_order.most_starts - 1
+    return replace(result, runners_up=evaluate.runners_up(result, most))
 
 
 class _KnownLosses:
@@ -473,6 +478,25 @@ class CandidateEvaluator:
             f"All {1 + len(worse)} candidates that do not diverge in a batch do so alone. Lower "
             "the upper end of the stiffness interval or raise substeps_per_frame in the profile."
         )
+
+    def runners_up(self, result: SearchResult, most: int) -> tuple[SimulationParameters, ...]:
+        """Return the next best candidates, each of which connects nodes over another distance.
+
+        Args:
+            result: The best candidate.
+            most: How many at most; fewer if others are much worse.
+        """
+        chosen = [result.parameters]
+        for loss, parameters in sorted(self._judged, key=lambda each: each[0]):
+            if len(chosen) > most or loss > _LITTLE_WORSE * result.loss_after:
+                break
+            radii = np.array([each.connection_radius for each in chosen])
+            ratio = np.maximum(radii, parameters.connection_radius) / np.minimum(
+                radii, parameters.connection_radius
+            )
+            if loss >= result.loss_after and np.all(ratio > _OTHER_RADIUS):
+                chosen.append(parameters)
+        return tuple(chosen[1:])
 
     def _settle(
         self, masters: Many[MasterTopology], candidates: Many[SimulationParameters]

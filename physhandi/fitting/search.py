@@ -40,6 +40,8 @@ class SearchResult:
     """Interval in which each searched parameter was looked for at last."""
     widened: tuple[str, ...] = ()
     """Parameters whose interval was lengthened during the search."""
+    runners_up: tuple[SimulationParameters, ...] = ()
+    """The next best parameters, which connect nodes over other distances, the best first."""
 
     @property
     def note(self) -> str:

@@ -1,6 +1,7 @@
 """Stage 2, first order: fits a stiffness and a damping of every spring by gradient descent.
 
-`optimise_springs` owns the loop, `Material` the learned values, `SpringDescent` the gradients.
+`optimise_springs` owns the loop, `Material` the learned values, `SpringDescent` the gradients;
+`fit_steady_springs` begins again from another candidate of the search where motion is unsteady.
 """
 
 import logging
@@ -32,10 +33,12 @@ from physhandi.fitting.object_problem import (
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.rest_state import hold_still
 from physhandi.one_thread import one_thread
-from physhandi.progress import Progress
+from physhandi.progress import Preview, Progress
 from physhandi.simulation import differentiable
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.surface import typical_distance
 
 CONTACT = {
     "restitution": (0.0, 1.0),
@@ -49,6 +52,10 @@ SMALLEST_VALUE = 1e-6
 State = tuple[Float[Tensor, "node 3"], Float[Tensor, "node 3"]]
 """Positions [m] and velocities [m/s] of the object nodes."""
 SPRING_STAGE = "first_order"
+STEADY = 0.05
+"""Distance by which `NUDGE` may move a steady motion on average, in typical distances of nodes."""
+NUDGE = 0.01
+"""Part of the stiffness by which motion is tried; an unsteady one is moved as far by rounding."""
 _WHOLE = -1
 """Stored reach of gradients that were never too steep."""
 logger = logging.getLogger(__name__)
@@ -76,6 +83,139 @@ class FirstOrderResult:
     """Iteration and the mean loss that ranks it [m²]."""
     stopped: str = ""
     """Why the descent ended early; empty if all iterations were made."""
+    sway: float = 0.0
+    """Largest mean distance by which `NUDGE` more or less stiffness moves the fitted frames, in
+    typical distances of nodes; infinite where they diverge. Zero if it was not asked."""
+    start: int = 0
+    """Number of the candidate of the search that the springs began as; 0 is the best."""
+
+    @property
+    def note(self) -> str:
+        """What a stage tells of it besides its losses; empty if that is nothing."""
+        began = (
+            f"Began from candidate {self.start + 1} of the search: what became of those before was "
+            "unsteady."
+        )
+        return " ".join(filter(None, (began if self.start else "", self.stopped)))
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the fitted motion hardly depends on a little more or less stiffness."""
+        return self.sway <= STEADY
+
+
+def fit_steady_springs(
+    problems: Many[ObjectProblem],
+    starts: Many[SimulationParameters],
+    config: ObjectFitConfig,
+    progress: Progress,
+    *,
+    device: str = "cpu",
+    checkpointer: Checkpointer | None = None,
+) -> FirstOrderResult:
+    """Fit springs from one candidate of a search after the other until their motion is steady.
+
+    A body about to buckle goes one way or another by rounding alone: its loss is luck, and so is
+    its prediction. Other springs between the same nodes explain it as well and do not.
+
+    Args:
+        problems: One for each sequence; all show the same object.
+        starts: Global parameters that the search found, the best first.
+        config: Settings of stage 2.
+        progress: Receives a report each iteration.
+        device: Warp device.
+        checkpointer: Keeps the state after an iteration; None keeps nothing.
+
+    Returns:
+        The first steady result; if there is none, that with the least loss.
+
+    Raises:
+        FitError: As `optimise_springs` does with the first start.
+    """
+    results: list[FirstOrderResult] = []
+    for number, start in enumerate(starts[: config.first_order.most_starts]):
+        listener = _LaterStart(progress, number, results[-1].sway) if results else progress
+        try:
+            result = optimise_springs(
+                problems,
+                start,
+                config,
+                listener,
+                device=device,
+                checkpointer=checkpointer,
+                loop=f"{SPRING_STAGE}_{number}" if number else SPRING_STAGE,
+            )
+        except FitError as error:
+            if not results:
+                raise
+            logger.warning("%s: start %d fails. %s", SPRING_STAGE, number + 1, error)
+            continue
+        sway = motion_sway(problems, result, device)
+        results.append(replace(result, sway=sway, start=number))
+        if results[-1].is_steady:
+            return results[-1]
+    return min(results, key=lambda each: each.loss_after)
+
+
+def motion_sway(problems: Many[ObjectProblem], result: FirstOrderResult, device: str) -> float:
+    """Measure how far a little more or less stiffness moves the fitted frames.
+
+    Args:
+        problems: One for each sequence.
+        result: Their models.
+        device: Warp device.
+
+    Returns:
+        `FirstOrderResult.sway`.
+    """
+    sways: list[float] = []
+    for problem in problems:
+        model = result.models[problem.name]
+        parameters = problem_parameters(result.parameters, problem)
+        simulator = Simulator(model, parameters, device=device)
+        motions: list[ndarray] = []
+        for factor in (1.0, 1.0 - NUDGE, 1.0 + NUDGE):
+            simulator.set_material(stiffness=factor * model.stiffness)
+            try:
+                motion = simulator.rollout(problem.control[: problem.frame_count])
+            except SimulationDivergedError:
+                return math.inf
+            motions.append(motion.position.astype(np.float64))
+        shifts = [np.linalg.norm(motion - motions[0], axis=-1).mean() for motion in motions[1:]]
+        sways.append(max(shifts) / typical_distance(problem.rest_node))
+    return float(max(sways))
+
+
+class _LaterStart(Progress):
+    """Hears of a descent that begins after others, whose iterations count before its own."""
+
+    def __init__(self, progress: Progress, number: int, sway: float) -> None:
+        self._progress, self._number = progress, number
+        self._note = (
+            f"The fitted motion is unsteady: {NUDGE:.0%} of stiffness moves it by "
+            f"{sway:.2g} node distances. Springs are fitted from another candidate of the search."
+        )
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        message, self._note = " ".join(filter(None, (self._note, message))), ""
+        before = self._number * total
+        self._progress.report(stage, before + iteration, before + total, loss, message)
+
+    def wants_preview(self) -> bool:
+        return self._progress.wants_preview()
+
+    def preview(self, make: Callable[[], Preview]) -> None:
+        self._progress.preview(make)
+
+    def check_cancelled(self) -> None:
+        self._progress.check_cancelled()
 
 
 @one_thread()
@@ -87,6 +227,7 @@ def optimise_springs(
     *,
     device: str = "cpu",
     checkpointer: Checkpointer | None = None,
+    loop: str = SPRING_STAGE,
 ) -> FirstOrderResult:
     """Fit each spring's own stiffness and damping by gradient descent through the simulator.
 
@@ -99,6 +240,7 @@ def optimise_springs(
         progress: Receives a report each iteration.
         device: Warp device.
         checkpointer: Keeps the state after an iteration; None keeps nothing.
+        loop: Name under which it does.
 
     Returns:
         The best models, as `FirstOrderConfig` ranks them.
@@ -117,7 +259,7 @@ def optimise_springs(
     course = _Course(models, parameters, loss_before, is_candidate=not settings.judges_online)
     descent = SpringDescent(material, parameters, config, device)
     checkpointer = checkpointer or Checkpointer()
-    first = course.resume(problems, descent, checkpointer)
+    first = course.resume(problems, descent, checkpointer, loop)
     if first:
         last = course.curve[-1][1]
         progress.report(SPRING_STAGE, first, settings.iterations, last, resumed_note(first))
@@ -149,7 +291,7 @@ def optimise_springs(
         if _is_judged(iteration, settings) and loss < course.loss:
             course.models, course.parameters, course.loss = now, now_parameters, loss
         course.curve.append([float(iteration + 1), loss])
-        checkpointer.offer(SPRING_STAGE, iteration + 1, lambda: course.state(problems, descent))
+        checkpointer.offer(loop, iteration + 1, lambda: course.state(problems, descent))
         progress.report(SPRING_STAGE, iteration + 1, settings.iterations, loss, message)
     return _settled(problems, course.result(loss_before, stopped), config, device)
 
@@ -194,11 +336,15 @@ class _Course:
         return state
 
     def resume(
-        self, problems: Many[ObjectProblem], descent: "SpringDescent", checkpointer: Checkpointer
+        self,
+        problems: Many[ObjectProblem],
+        descent: "SpringDescent",
+        checkpointer: Checkpointer,
+        loop: str,
     ) -> int:
         """Go on from the latest checkpoint, if there is one; return its iteration, else 0."""
         like = self.state(problems, descent)
-        resumed = checkpointer.load(SPRING_STAGE, like, growing=("curve",))
+        resumed = checkpointer.load(loop, like, growing=("curve",))
         if resumed is None:
             return 0
         state = resumed.tensors

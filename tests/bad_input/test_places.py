@@ -206,7 +206,7 @@ def test_an_interrupted_fit_with_a_torn_list_of_stages_begins_anew(
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "optimise_springs", interrupt)
+        patch.setattr(pipeline, "fit_steady_springs", interrupt)
         assert here(*RECONSTRUCT, "out")[0] == 130
     stages = here.folder / "out/attempts/1/stages.json"
     stages.write_text(stages.read_text()[:40])

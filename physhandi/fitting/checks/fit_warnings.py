@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from physhandi.data.files import named_fields
-from physhandi.data.layout import SEARCH_FILE, SHAPE_FILE, SequenceFiles
+from physhandi.data.layout import SEARCH_FILE, SHAPE_FILE, STEADINESS_FILE, SequenceFiles
 from physhandi.data.run_folder import read_yaml
 from physhandi.data.sequence import Sequence
 from physhandi.fitting import artefacts
@@ -28,6 +28,7 @@ from physhandi.simulation.parameters import PARAMETERS
 
 Code = Literal[
     "at_bound",
+    "unsteady",
     "worse_than_static",
     "worse_than_rigid_follow",
     "worse_than_last_residual",
@@ -119,7 +120,8 @@ def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> li
         message = skipped_object([sequence])
         skipped = [] if message is None else [FitWarning(code="object_skipped", message=message)]
         return [*skipped, *_unseen_hands(out, sequence), *_lone_views(out, sequence)]
-    doubts = [*_at_bounds(out), *_worse_than_baselines(scores), *_doubts_of_shape(out)]
+    doubts = [*_at_bounds(out), *_unsteady(out), *_worse_than_baselines(scores)]
+    doubts += _doubts_of_shape(out)
     model = artefacts.load_model(out, sequence.name)
     doubts += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
     if (out / files.observation("point")).is_file():
@@ -152,6 +154,25 @@ def _at_bounds(out: Path) -> Iterator[FitWarning]:
             f"the {side} end of the interval in which it was searched "
             f"({interval_text(name, intervals[name])}): a better value may lie beyond. Widen "
             f"{INTERVALS}.{name}.{side}, or raise object_.search.generations.",
+        )
+
+
+def _unsteady(out: Path) -> Iterator[FitWarning]:
+    """Tell if the fitted motion goes elsewhere with a little more or less stiffness."""
+    if not (out / STEADINESS_FILE).is_file():
+        return
+    steadiness = named_fields(read_yaml(out / STEADINESS_FILE)) or {}
+    nudge, sway, limit = (steadiness[name] for name in ("nudge", "sway", "limit"))
+    if sway is None or sway > limit:
+        shift = "lets it diverge"
+        if sway is not None:
+            shift = f"moves nodes by {sway:.0%} of their distance ({limit:.0%} would be steady)"
+        yield FitWarning(
+            code="unsteady",
+            message=f"The fitted motion is unsteady: {nudge:.0%} more or less stiffness {shift}. "
+            "The object is about to buckle, and rounding decides which way it goes, so its "
+            "prediction is partly luck. Try another seed of the search (object_.search.seed), a "
+            "longer connection_radius, or more frames.",
         )
 
 

@@ -174,17 +174,17 @@ def test_a_fit_takes_a_profile_file_and_single_settings(
 
 def test_an_interrupted_fit_goes_on(terminal: Terminal, quick: PipelineConfig) -> None:
     order = ("reconstruct", "sheet", "--out", "mine", "--device", "cpu")
-    original = pipeline.optimise_springs
+    original = pipeline.fit_steady_springs
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "optimise_springs", interrupt)
+        patch.setattr(pipeline, "fit_steady_springs", interrupt)
         assert terminal(*order) == 130
     assert terminal.error.splitlines()[-1] == "physhandi: interrupted"
     assert Run.open("mine").state == "cancelled"
-    assert pipeline.optimise_springs is original
+    assert pipeline.fit_steady_springs is original
     assert terminal(*order, "--store", f"file://{Path.cwd()}/store") == 0
     assert "first_order" in terminal.error
     assert "zeroth_order" not in terminal.error

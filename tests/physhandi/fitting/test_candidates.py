@@ -14,14 +14,14 @@ from support.waiting import LIMIT_S
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError, FitError, SimulationDivergedError
 from physhandi.fitting import object_reconstruction
-from physhandi.fitting.config import ObjectFitConfig
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
 from physhandi.fitting.object_problem import (
     ObjectProblem,
     build_problem,
     build_problem_model,
     mean_loss,
 )
-from physhandi.fitting.object_reconstruction import CandidateEvaluator
+from physhandi.fitting.object_reconstruction import CandidateEvaluator, search_object
 from physhandi.fitting.search import SearchResult
 from physhandi.progress import NullProgress, Preview, Progress
 from physhandi.simulation.engines.batch import BatchSimulator, shared_out
@@ -308,6 +308,41 @@ def test_the_best_of_a_search_must_hold_alone_too(
     falling |= {parameters.stiffness for parameters, _ in evaluate(drawn(4))}
     with pytest.raises(FitError, match=r"All \d+ candidates .* do so alone"):
         evaluate.best_that_holds(found)
+
+
+def test_runners_up_connect_other_nodes_and_are_little_worse() -> None:
+    evaluate = CandidateEvaluator([sheet("slow", 0.05)], ObjectFitConfig(), NullProgress())
+    radii = [0.16, 0.17, 0.2, 0.21, 0.14, 0.12, 0.3]
+    evaluate._judged = [
+        (loss, PARAMETERS.replace(connection_radius=radius))
+        for loss, radius in zip((1.0, 1.05, 1.1, 1.12, 1.15, 1.2, 1.3), radii, strict=True)
+    ][::-1]
+    best = SearchResult(parameters=PARAMETERS, loss_before=9.0, loss_after=1.0, curve=[])
+
+    def radii_of(most: int) -> list[float]:
+        return [each.connection_radius for each in evaluate.runners_up(best, most)]
+
+    # 0.17 and 0.21 m are within a tenth of better ones, and the loss of 0.3 m is 30 % higher.
+    assert radii_of(5) == [0.2, 0.14, 0.12]
+    assert radii_of(2) == [0.2, 0.14]
+    assert radii_of(0) == []
+
+
+def test_a_search_gives_as_many_runners_up_as_springs_may_start_from() -> None:
+    radius = SearchVariable(low=0.11, high=0.3, scale="log")
+    search = SearchConfig(generations=2, population=6, variables={"connection_radius": radius})
+    problem, settings = sheet("slow", 0.05), ObjectFitConfig(search=search)
+    assert search_object([problem], PARAMETERS, settings, NullProgress()).runners_up == ()
+    settings = settings.replace(first_order=FirstOrderConfig(most_starts=3))
+    result = search_object([problem], PARAMETERS, settings, NullProgress())
+    assert len(result.runners_up) == 2
+    losses = [
+        mean_loss([problem], {"slow": build_problem_model(problem, p)}, p, settings, "cpu")
+        for p in (result.parameters, *result.runners_up)
+    ]
+    assert losses[0] == pytest.approx(result.loss_after, rel=1e-4)
+    assert losses == sorted(losses)
+    assert losses[-1] <= 1.25 * losses[0]
 
 
 def test_a_batch_gets_substeps_that_are_enough_for_each_of_its_sequences() -> None:

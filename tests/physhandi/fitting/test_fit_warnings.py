@@ -197,6 +197,23 @@ def test_a_parameter_at_its_bound_is_named_with_what_to_do(
 
 
 @pytest.mark.parametrize(
+    ("sway", "said"),
+    [(0.05, None), (0.123, "moves nodes by 12% of their distance"), (None, "lets it diverge")],
+)
+def test_a_motion_that_hangs_on_rounding_is_told(
+    stored: Stored, sequence: Sequence, sway: float | None, said: str | None
+) -> None:
+    stored.array("rollout", GRID + RISE)
+    stored.yaml("steadiness", {"nudge": 0.01, "limit": 0.05, "sway": sway})
+    messages = found(stored, sequence)
+    assert set(messages) == (set() if said is None else {"unsteady"})
+    if said is not None:
+        (message,) = messages["unsteady"]
+        assert f"1% more or less stiffness {said}" in message
+        assert "object_.search.seed" in message
+
+
+@pytest.mark.parametrize(
     ("motion", "codes"),
     [
         (-0.5 * RISE, {"worse_than_static": 2, "worse_than_rigid_follow": 2}),
