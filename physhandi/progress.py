@@ -78,6 +78,37 @@ class NullProgress(Progress):
     """Progress of work that nobody watches."""
 
 
+class RelayedProgress(Progress):
+    """Passes everything on to another one; a subclass changes reports."""
+
+    def __init__(self, progress: Progress) -> None:
+        """Pass on to `progress`."""
+        self._progress = progress
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        """Pass it on; see `Progress.report`."""
+        self._progress.report(stage, iteration, total, loss, message)
+
+    def wants_preview(self) -> bool:
+        """Ask the other one."""
+        return self._progress.wants_preview()
+
+    def preview(self, make: Callable[[], Preview]) -> None:
+        """Pass it on; see `Progress.preview`."""
+        self._progress.preview(make)
+
+    def check_cancelled(self) -> None:
+        """Ask the other one."""
+        self._progress.check_cancelled()
+
+
 _QUARTERS = 4
 _LONGEST_SILENCE_S = 60.0
 """Time after which a line is printed although no further quarter is done [s]."""

@@ -9,7 +9,7 @@ import json
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Container
+from collections.abc import Container
 from collections.abc import Sequence as Many
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -37,7 +37,7 @@ from physhandi.fitting.object_problem import (
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_parameters
 from physhandi.fitting.search_bounds import fit_intervals, measure_object
-from physhandi.progress import Preview, Progress
+from physhandi.progress import Progress, RelayedProgress
 from physhandi.simulation.contact_intervals import ContactIntervals
 from physhandi.simulation.engines.batch import (
     BatchSimulator,
@@ -184,11 +184,12 @@ def _digests(candidates: Many[SimulationParameters]) -> ndarray:
     return np.frombuffer(b"".join(digests), np.uint8).reshape(-1, _DIGEST)
 
 
-class _ResumedSearch(Progress):
+class _ResumedSearch(RelayedProgress):
     """Hears of the generations after those whose losses were known, and where these ended."""
 
     def __init__(self, progress: Progress, known_losses: _KnownLosses) -> None:
-        self._progress, self._known_losses = progress, known_losses
+        super().__init__(progress)
+        self._known_losses = known_losses
 
     def report(
         self,
@@ -203,16 +204,7 @@ class _ResumedSearch(Progress):
         if self._known_losses.resumed is not None:
             self._known_losses.resumed = None
             message = resumed_note(iteration)
-        self._progress.report(stage, iteration, total, loss, message)
-
-    def wants_preview(self) -> bool:
-        return self._progress.wants_preview()
-
-    def preview(self, make: Callable[[], Preview]) -> None:
-        self._progress.preview(make)
-
-    def check_cancelled(self) -> None:
-        self._progress.check_cancelled()
+        super().report(stage, iteration, total, loss, message)
 
 
 def check_problem(

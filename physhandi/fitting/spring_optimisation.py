@@ -33,7 +33,7 @@ from physhandi.fitting.object_problem import (
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.rest_state import hold_still
 from physhandi.one_thread import one_thread
-from physhandi.progress import Preview, Progress
+from physhandi.progress import Progress, RelayedProgress
 from physhandi.simulation import differentiable
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -186,11 +186,12 @@ def motion_sway(problems: Many[ObjectProblem], result: FirstOrderResult, device:
     return float(max(sways))
 
 
-class _LaterStart(Progress):
+class _LaterStart(RelayedProgress):
     """Hears of a descent that begins after others, whose iterations count before its own."""
 
     def __init__(self, progress: Progress, number: int, sway: float) -> None:
-        self._progress, self._number = progress, number
+        super().__init__(progress)
+        self._number = number
         self._note = (
             f"The fitted motion is unsteady: {NUDGE:.0%} of stiffness moves it by "
             f"{sway:.2g} node distances. Springs are fitted from another candidate of the search."
@@ -206,16 +207,7 @@ class _LaterStart(Progress):
     ) -> None:
         message, self._note = " ".join(filter(None, (self._note, message))), ""
         before = self._number * total
-        self._progress.report(stage, before + iteration, before + total, loss, message)
-
-    def wants_preview(self) -> bool:
-        return self._progress.wants_preview()
-
-    def preview(self, make: Callable[[], Preview]) -> None:
-        self._progress.preview(make)
-
-    def check_cancelled(self) -> None:
-        self._progress.check_cancelled()
+        super().report(stage, before + iteration, before + total, loss, message)
 
 
 @one_thread()
