@@ -188,6 +188,7 @@ def annotate(
     folder = find_sequence(sequence, data_dir).folder
     require_unread(open_catalog(data_dir), folder)
     clicks = [_click(text) for text in all_values(click)]
+    _check_tracker(track_model, trusts_code=trust_model_code, has_clicks=bool(clicks))
     with watched(True) as progress:
         done = find(
             folder,
@@ -206,6 +207,20 @@ def annotate(
             **_doubts(done),
         }
     )
+
+
+def _check_tracker(track_model: Path | None, *, trusts_code: bool, has_clicks: bool) -> None:
+    """Refuse what would be ignored without a word.
+
+    Raises:
+        UsageError: If there is nothing to follow, or no code to trust.
+    """
+    if track_model is not None and not has_clicks:
+        raise UsageError("--track-model follows what --click names; give that too.")
+    if trusts_code and track_model is None:
+        raise UsageError(
+            "--trust-model-code is for the code of a --track-model; give its folder too."
+        )
 
 
 def _method(sequence: Sequence) -> dict[str, Any]:
@@ -524,8 +539,9 @@ def import_capture(
         hands=all_values(hands, ("right",)),
     )
     clicks = [_click(text) for text in all_values(click)]
-    if not clicks and (mask_model or track_model):
-        raise UsageError("--mask-model and --track-model find what --click names; give that too.")
+    if mask_model is not None and not clicks:
+        raise UsageError("--mask-model finds what --click names; give that too.")
+    _check_tracker(track_model, trusts_code=trust_model_code, has_clicks=bool(clicks))
 
     def check(cameras: "Many[RecordedView]", frame_count: int) -> None:
         """Refuse clicks before minutes are spent on images."""

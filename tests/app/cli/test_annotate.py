@@ -69,10 +69,26 @@ def test_models_of_the_user_are_named_by_their_folders(tmp_path, capsys):
     code, _, error = call(capsys, *command, "--track-model", folder)
     assert code == 2
     assert "--trust-model-code" in error
-    capture = ("import", "capture", tmp_path, "--out", tmp_path / "out", "--track-model", folder)
-    code, _, error = call(capsys, *capture)
+
+
+def test_options_of_networks_that_would_be_ignored_are_refused(tmp_path, capsys):
+    sequence, _ = write_disc(tmp_path / "disc", frames=2)
+    view, frame, x, y = disc_click()
+    click = ("--click", f"{view},{frame},{x:g},{y:g}")
+    capture = ("import", "capture", tmp_path, "--out", tmp_path / "out")
+    tracker = ("--track-model", tmp_path)
+    for command in (("annotate", sequence.folder), capture):
+        for options, message in (
+            (tracker, "--track-model follows what --click names"),
+            ((*click, "--trust-model-code"), "the code of a --track-model"),
+        ):
+            code, _, error = call(capsys, *command, *options)
+            assert code == 2
+            assert message in error
+    code, _, error = call(capsys, *capture, "--mask-model", tmp_path)
     assert code == 2
-    assert "find what --click names" in error
+    assert "--mask-model finds what --click names" in error
+    assert not (tmp_path / "out").exists()
 
 
 def test_hands_of_an_impossible_size_are_told_at_once(tmp_path, capsys, monkeypatch):
