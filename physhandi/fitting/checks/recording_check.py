@@ -182,19 +182,31 @@ def depth_scale_problems(sequence: Sequence) -> list[Problem]:
     """
     detected = named_fields(sequence.provenance.get(MEASURED_PALMS)) or {}
     scales = named_fields(sequence.provenance.get("depth_scale")) or {}
-    problems: list[Problem] = []
+    possible: dict[str, float] = {}
+    impossible: list[tuple[View, float]] = []
     for view in sequence.views if sequence.metric else ():
         if not view.has_depth:
             continue
         keypoint = view.keypoint
         palm: Any = detected.get(view.name) if keypoint is None else palm_length(view, keypoint)
-        is_length = isinstance(palm, float) and _PALMS_STORED[0] < palm < _PALMS_STORED[1]
-        if is_length and is_impossible_palm(palm):
-            problems.append(_wrong_scale(view, palm, scales.get(view.name)))
-    return problems
+        if not isinstance(palm, float) or not _PALMS_STORED[0] < palm < _PALMS_STORED[1]:
+            continue
+        if is_impossible_palm(palm):
+            impossible.append((view, palm))
+        else:
+            possible[view.name] = palm
+    return [_wrong_scale(view, palm, scales.get(view.name), possible) for view, palm in impossible]
 
 
-def _wrong_scale(view: View, length: float, scale: Any) -> Problem:
+def _wrong_scale(view: View, length: float, scale: Any, possible: Mapping[str, float]) -> Problem:
+    """Doubt the depth of a view, or its keypoints where other views measure hands of a right size.
+
+    Args:
+        view: The view.
+        length: From wrist to knuckles in it [m].
+        scale: Metres per unit of its depth, if a number is noted.
+        possible: The lengths of views in which they are those of hands [m].
+    """
     ratio = length / PALM_LENGTH
     right = scale / ratio if isinstance(scale, float) else 0.0
     likely = [one for one in likely_scales(right) if one <= LARGEST_SCALE] if right > 0 else []
@@ -204,11 +216,15 @@ def _wrong_scale(view: View, length: float, scale: Any) -> Problem:
     else:
         remedy = f"multiply its depth images by {1 / ratio:.2g}"
     low, high = (100 * end for end in PALM_LENGTHS)
+    cause = "the scale of its depth is wrong"
+    if possible:
+        others = ", ".join(f"{100 * palm:.2g} in '{name}'" for name, palm in possible.items())
+        cause += f", or its keypoints are not on hands (there are {others})"
+        remedy = f"look at its keypoints on the check page; if they are on hands, {remedy}"
     return Problem(
         level="warning",
         message=f"View '{view.name}': by its depth hands measure {100 * length:.3g} cm from wrist "
-        f"to knuckles, {ratio:.2g} times as much as a hand's ({low:g} to {high:g} cm): the scale "
-        "of its depth is wrong.",
+        f"to knuckles, {ratio:.2g} times as much as a hand's ({low:g} to {high:g} cm): {cause}.",
         file=f"{view.place}/depth",
         remedy=remedy,
     )
