@@ -192,9 +192,12 @@ class _LaterStart(RelayedProgress):
     def __init__(self, progress: Progress, number: int, sway: float) -> None:
         super().__init__(progress)
         self._number = number
+        shift = f"moves it by {sway:.2g} node distances"
+        if math.isinf(sway):
+            shift = "lets it diverge"
         self._note = (
-            f"The fitted motion is unsteady: {NUDGE:.0%} of stiffness moves it by "
-            f"{sway:.2g} node distances. Springs are fitted from another candidate of the search."
+            f"The fitted motion is unsteady: {NUDGE:.0%} of stiffness {shift}. Springs are fitted "
+            "from another candidate of the search."
         )
 
     def report(

@@ -131,8 +131,16 @@ def test_a_later_candidate_that_fails_is_passed_over() -> None:
         fitted(coarse, SOFT)
 
 
-def test_iterations_of_a_later_start_count_on_and_say_why() -> None:
+@pytest.mark.parametrize(
+    ("sway", "said"), [(None, "moves it by 0."), (math.inf, "lets it diverge")]
+)
+def test_iterations_of_a_later_start_count_on_and_say_why(
+    sway: float | None, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     reports: list[tuple[int, int, str]] = []
+    if sway is not None:
+        sways = iter([sway, 0.0])
+        monkeypatch.setattr(spring_optimisation, "motion_sway", lambda *_: next(sways))
 
     class Heard(NullProgress):
         def report(
@@ -148,7 +156,7 @@ def test_iterations_of_a_later_start_count_on_and_say_why() -> None:
 
     fitted(STIFF, SOFT, progress=Heard(), iterations=2)
     assert [report[:2] for report in reports] == [(1, 2), (2, 2), (3, 4), (4, 4)]
-    assert "unsteady: 1% of stiffness moves it by" in reports[2][2]
+    assert f"unsteady: 1% of stiffness {said}" in reports[2][2]
     assert [report[2] for report in reports[:2]] == ["", ""]
 
 
