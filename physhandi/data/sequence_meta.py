@@ -17,7 +17,7 @@ UNFINISHED = "unfinished"
 """Provenance field of masks that are being stored."""
 FILE = "sequence.yaml"
 LONGEST_NAME = 64
-"""Letters of the longest name of a sequence, a view or a hand."""
+"""Letters of the longest name of a sequence or a view."""
 SAFE_NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{LONGEST_NAME}}}")
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
 _SIZE_LIMIT = 4_000_000

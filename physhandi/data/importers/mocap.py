@@ -1,7 +1,6 @@
 """Motion capture of a rope that grippers swing: markers in, point controllers out."""
 
 import math
-import re
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from physhandi.data.arrays import read_array
 from physhandi.data.length_unit import doubt_extent, doubt_position
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_meta import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta, safe_name
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import ImportFailedError, UsageError
 from physhandi.progress import NullProgress, Progress
@@ -327,4 +326,4 @@ def _check_chain(path: Path, marker: ndarray, unit: LengthUnit) -> None:
 
 
 def _name(path: Path) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", path.stem)[:64] or "trajectory"
+    return safe_name(path.stem) or "trajectory"

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from physhandi.data.files import named_fields
 from physhandi.data.layout import SEARCH_FILE, SHAPE_FILE, STEADINESS_FILE, SequenceFiles
-from physhandi.data.run_folder import read_yaml
+from physhandi.data.run_folder import read_yaml, reading
 from physhandi.data.sequence import Sequence
 from physhandi.fitting import artefacts
 from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, shows_palm, skipped_object
@@ -159,11 +159,14 @@ def _at_bounds(out: Path) -> Iterator[FitWarning]:
 
 def _unsteady(out: Path) -> Iterator[FitWarning]:
     """Tell if the fitted motion goes elsewhere with a little more or less stiffness."""
-    if not (out / STEADINESS_FILE).is_file():
+    path = out / STEADINESS_FILE
+    if not path.is_file():
         return
-    steadiness = named_fields(read_yaml(out / STEADINESS_FILE)) or {}
-    nudge, sway, limit = (steadiness[name] for name in ("nudge", "sway", "limit"))
-    if sway is None or sway > limit:
+    with reading(path):
+        steadiness = named_fields(read_yaml(path)) or {}
+        nudge, sway, limit = (steadiness[name] for name in ("nudge", "sway", "limit"))
+        is_steady = sway is not None and sway <= limit
+    if not is_steady:
         shift = "lets it diverge"
         if sway is not None:
             shift = f"moves nodes by {sway:.0%} of their distance ({limit:.0%} would be steady)"

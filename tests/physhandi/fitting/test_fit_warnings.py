@@ -13,6 +13,7 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import write_sequence
+from physhandi.errors import RunError
 from physhandi.fitting.checks.fit_warnings import fit_warnings, with_warnings
 from physhandi.metrics.report import score_run
 from physhandi.run import warnings_in
@@ -211,6 +212,16 @@ def test_a_motion_that_hangs_on_rounding_is_told(
         (message,) = messages["unsteady"]
         assert f"1% more or less stiffness {said}" in message
         assert "object_.search.seed" in message
+
+
+@pytest.mark.parametrize("content", [{"nudge": 0.01}, {"nudge": 0.01, "limit": 0.05, "sway": "x"}])
+def test_a_damaged_file_of_steadiness_is_named(
+    stored: Stored, sequence: Sequence, content: dict[str, Any]
+) -> None:
+    stored.array("rollout", GRID + RISE)
+    stored.yaml("steadiness", content)
+    with pytest.raises(RunError, match=r"steadiness\.yaml is damaged"):
+        found(stored, sequence)
 
 
 @pytest.mark.parametrize(
