@@ -112,7 +112,7 @@ class FittedObject:
         self._latest: tuple[tuple[float, ...], SpringMassModel] | None = None
         self._edited: tuple[SpringMassModel, Edits, SpringMassModel] | None = None
         self._simulator: Simulator | None = None
-        self._limit: tuple[SpringMassModel, float, float] | None = None
+        self._limit: tuple[SpringMassModel, tuple[float, float], float] | None = None
 
     @classmethod
     def of(cls, run: RunFolder | Path | str, sequence: str | None = None) -> "FittedObject":
@@ -200,8 +200,14 @@ class FittedObject:
             not if edits change what is joined or held.
 
         Raises:
-            UsageError: If an edit cannot be made; says which.
+            UsageError: If an edit cannot be made (says which), or hands shall push that have no
+                surface.
         """
+        if parameters.hand_pushes and not len(self._unedited.hand_face):
+            raise UsageError(
+                "hand_pushes needs the surface of a hand, but the control nodes of this object are "
+                "single points. Leave it off."
+            )
         self._choose_controls(controls)
         edits = self.edits if edits is None else edits
         unedited = self._model(parameters)
@@ -236,10 +242,11 @@ class FittedObject:
     def needed_substeps(self, rollout: ObjectRollout) -> int:
         """Estimate the fewest substeps a frame that a rollout survives, without any margin."""
         model, parameters = rollout.model, rollout.parameters
-        latest, scale = self._limit, parameters.stiffness_scale
-        if latest is None or latest[0] is not model or latest[1] != scale:
+        push = parameters.push_stiffness if parameters.hand_pushes else 0.0
+        latest, loads = self._limit, (parameters.stiffness_scale, push)
+        if latest is None or latest[0] is not model or latest[1] != loads:
             step = largest_stable_step(model, parameters, rollout.control[0])
-            latest = self._limit = (model, scale, step)
+            latest = self._limit = (model, loads, step)
         return max(1, math.ceil(1.0 / (parameters.simulated_frame_rate * latest[2])))
 
     def simulate(
@@ -628,5 +635,6 @@ def _hold_anew(
         damping=joined(model.damping, parameters.damping),
         control_count=len(control_0),
         attached=always(len(springs)),
+        hand_face=model.hand_face_of(np.array(chosen, np.int64)),
         rod=rod,
     )

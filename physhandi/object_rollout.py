@@ -12,6 +12,7 @@ from numpy import ndarray
 from physhandi.appearance.texture import colored_surface
 from physhandi.data.exporters.export import export_scene
 from physhandi.data.exporters.scene_data import SceneData
+from physhandi.data.hand_surface import stored_faces
 from physhandi.data.layout import PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
@@ -374,6 +375,11 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
             edits = read_edits(run.out / files.edits)
         with reading(run.out / files.unedited):
             unedited = SpringMassModel.from_tensors(run.tensors(files.unedited))
+    if not len(model.hand_face):
+        # Runs that were stored before hands could push have the hands' surface beside the model.
+        faces = stored_faces(run.out, sequence_name, model.control_count - model.pin_count)
+        model = replace(model, hand_face=faces)
+        unedited = None if unedited is None else replace(unedited, hand_face=faces)
     return ObjectRollout(
         model=model,
         parameters=parameters,

@@ -22,6 +22,7 @@ from physhandi.data.attempt import Attempt, ResultStore
 from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.files import json_line
+from physhandi.data.hand_surface import stored_faces
 from physhandi.data.layout import (
     MATERIAL_FILE,
     METRICS_FILE,
@@ -603,6 +604,7 @@ def _problems(
                 object_node=object_node,
                 rest_node=rest_node,
                 control=control,
+                hand_face=stored_faces(attempt.out, sequence.name, control.shape[1]),
                 contacts=contacts,
                 frame_count=len(sequence.reconstruction_frames),
                 frame_rate=sequence.frame_rate,

@@ -64,6 +64,9 @@ OVERRIDES = (
     "collision_distance",
     "self_restitution",
     "self_friction",
+    "hand_pushes",
+    "push_stiffness",
+    "hand_friction",
     "substeps_per_frame",
 )
 """Parameters that `physhandi simulate` can change."""

@@ -7,12 +7,12 @@ compares them with what was observed (physics.md §4.1).
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int32
 from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -72,6 +72,8 @@ class ObjectProblem:
     """Position of a track less the weighted mean of its carriers, at frame 0 [m]."""
     surface_count: int | None = None
     """Leading nodes that lie on the surface, which alone enter the Chamfer term; None for all."""
+    hand_face: Int32[ndarray, "face 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+    """Triangles of the hands' surface, their corners control nodes; see `SpringMassModel`."""
     contacts: ContactIntervals | None = None
     """Contacts of the hands over time; None for contact with all that is near them at frame 0."""
 
@@ -151,6 +153,7 @@ def build_problem(
     cloud_points: int | None = 300,
     starts_at_rest: bool = False,
     contacts: ContactIntervals | None = None,
+    hand_face: Int32[ndarray, "face 3"] | None = None,
 ) -> ObjectProblem:
     """Reduce a sequence to the tensors that the object fit reads.
 
@@ -171,6 +174,7 @@ def build_problem(
         cloud_points: Most points of a frame that enter the Chamfer term; None for all.
         starts_at_rest: Whether the object rests at frame 0, whatever the tracks say.
         contacts: What the hands touch, and when; None for what is near them at frame 0, always.
+        hand_face: Triangles of the hands' surface, their corners control nodes; none if left out.
 
     Returns:
         The problem, on the CPU.
@@ -227,6 +231,7 @@ def build_problem(
         track_offset=torch.from_numpy(offset),
         surface_count=surface_count,
         contacts=contacts,
+        **({} if hand_face is None else {"hand_face": hand_face}),
     )
 
 
@@ -426,7 +431,12 @@ def build_problem_model(
         rest_node=problem.rest_node,
         contacts=problem.contacts,
     )
-    return replace(model, initial_velocity=problem.initial_velocity, clearance=problem.clearance)
+    return replace(
+        model,
+        initial_velocity=problem.initial_velocity,
+        clearance=problem.clearance,
+        hand_face=problem.hand_face,
+    )
 
 
 def simulate_problem(

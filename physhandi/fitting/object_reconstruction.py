@@ -547,17 +547,18 @@ class CandidateEvaluator:
         """Write one sequence's losses of the possible candidates into `losses`."""
         problem = self._problems[row]
         for index in possible:
-            if candidates[index].self_collision:
+            if candidates[index].has_contacts:
                 self._progress.check_cancelled()
+                model = replace(master.model(candidates[index]), hand_face=problem.hand_face)
                 losses[index] = mean_loss(
                     [problem],
-                    {problem.name: master.model(candidates[index])},
+                    {problem.name: model},
                     candidates[index],
                     self._config,
                     self._device,
                     acceleration_weight=self._config.acceleration_weight,
                 )
-        batch = [index for index in possible if not candidates[index].self_collision]
+        batch = [index for index in possible if not candidates[index].has_contacts]
         if batch:
             self._simulate_batch(row, master, candidates, batch, losses)
 

@@ -15,6 +15,7 @@ from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.checkpoint import Checkpointer
+from physhandi.data.hand_surface import joined_faces
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import RunFolder
@@ -123,8 +124,17 @@ def place_object(
         ground_height=sequence.ground_height,
         gravity=sequence.gravity,
     )
-    laid = replace(fitted_model, object_node=node, initial_velocity=velocity, clearance=clearance)
+    no_hands = joined_faces((), 0)
+    laid = replace(
+        fitted_model,
+        object_node=node,
+        initial_velocity=velocity,
+        clearance=clearance,
+        hand_face=no_hands,
+    )
     model = retopologize(laid, world, control[0], fitted=parameters, rest_node=rest_node)
+    surfaces = [(hand.vertex_count, hand.faces) for hand in _hand_models(motions)]
+    model = replace(model, hand_face=joined_faces(surfaces, control.shape[1]))
     model = gripped(model)
     if is_bent and np.array_equal(rest_node, fitted_model.object_node):
         # The shape at frame 0 was its rest shape, in which springs carried it; so here.

@@ -68,7 +68,8 @@ def rollout(
         friction: Of the ground; no gradient outside [0, 2].
         self_restitution: Of two object nodes; no gradient outside [0, 1].
         self_friction: Of two object nodes; no gradient outside [0, 2]. Neither has one without
-            `parameters.self_collision`. Which nodes collide is not differentiated.
+            `parameters.self_collision`. Which nodes collide, and which triangle of a hand pushes
+            which node, is not differentiated.
         initial_position: Object nodes at frame 0 [m].
         initial_velocity: Their velocities at frame 0 [m/s].
         device: Warp device to simulate on. Tensors may be elsewhere; results are where
@@ -185,7 +186,7 @@ class _DifferentiableSimulator:
                 "The rollout of a rope that bends has no gradient. Call it under torch.no_grad(), "
                 "or leave out the model's rod."
             )
-        if simulator.collision is not None:
+        if simulator.has_contacts:
             return GraphAdjoint(simulator)
         engine = simulator.engine
         fast = CudaAdjoint.of(simulator, engine) or CpuAdjoint.of(simulator, engine)

@@ -5,11 +5,14 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int, Int32
 from numpy import ndarray
 
 from physhandi.simulation.contact_intervals import acts_in, always
 from physhandi.simulation.rod import PREFIX, Rod
+
+_OPTIONAL = {"pin_place", "hand_face"}
+"""Arrays that are stored only if there is something in them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,6 +48,9 @@ class SpringMassModel:
         default_factory=lambda: np.zeros((0, 3), np.float32)
     )
     """Where the last control nodes are that never move because nodes are pinned to them [m]."""
+    hand_face: Int32[ndarray, "face 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+    """Triangles of the hands' surface, their corners control nodes counted from 0, in the order in
+    which they are seen counterclockwise from outside; none if control nodes are no surface."""
     rod: Rod | None = None
     """How the object bends, if it is a rope; None if springs alone hold its shape."""
 
@@ -84,6 +90,7 @@ class SpringMassModel:
                 f"expected ({self.virtual_spring_count}, 2), two frames a virtual spring."
             )
         self._check_pins()
+        self._check_hands()
         if self.rod is not None:
             self.rod.check(self.node_count, self.control_count)
 
@@ -114,6 +121,14 @@ class SpringMassModel:
             raise ValueError(
                 f"pin_place has shape {place.shape} or values that are not finite; expected three "
                 f"numbers for each of at most {self.control_count} control nodes."
+            )
+
+    def _check_hands(self) -> None:
+        corners = self.hand_face
+        if corners.shape[1:] != (3,) or not np.all((corners >= 0) & (corners < self.control_count)):
+            raise ValueError(
+                f"hand_face has shape {corners.shape} or names a control node outside "
+                f"0…{self.control_count - 1}; expected three of them for each triangle."
             )
 
     @property
@@ -150,6 +165,13 @@ class SpringMassModel:
         """Whether every virtual spring acts in all frames."""
         return bool(np.all(self.attached == always(1)))
 
+    def hand_face_of(self, controls: Int[ndarray, " chosen"]) -> Int32[ndarray, "some_face 3"]:
+        """Keep the hands' triangles of some control nodes, numbered anew in the order given."""
+        place = np.full(self.control_count, -1, np.int32)
+        place[controls] = np.arange(len(controls), dtype=np.int32)
+        face = place[self.hand_face]
+        return face[(face >= 0).all(axis=1)]
+
     def acts_in(self, frame: int) -> Bool[ndarray, " spring"]:
         """Mark the springs that act on the way to a frame; to frame 0, those of frame 1."""
         acts = np.ones(len(self.spring_nodes), dtype=bool)
@@ -169,13 +191,13 @@ class SpringMassModel:
         )
 
     def to_tensors(self) -> dict[str, ndarray]:
-        """Return every field as an array, ready for safetensors; no pins if there are none."""
+        """Return every field as an array, ready for safetensors; no pins or hands if none."""
         names = [field.name for field in fields(self) if field.name != "rod"]
         values = {name: getattr(self, name) for name in names}
         tensors = {
             name: value if isinstance(value, np.ndarray) else np.array([value], dtype=np.int32)
             for name, value in values.items()
-            if name != "pin_place" or self.pin_count
+            if name not in _OPTIONAL or len(value)
         }
         return tensors if self.rod is None else tensors | self.rod.to_tensors()
 
@@ -186,7 +208,7 @@ class SpringMassModel:
         Models that were stored before nodes had a clearance have none; the virtual springs of those
         that were stored before springs could be attached later are always attached. Objects that
         are no ropes, and those that were stored before ropes could bend, have no rod. Without pins
-        none are stored.
+        none are stored, nor triangles without hands.
 
         Raises:
             ValueError: If an array is missing, unknown or inconsistent.
@@ -195,7 +217,7 @@ class SpringMassModel:
         values: dict[str, Any] = {
             name: np.asarray(a) for name, a in tensors.items() if not name.startswith(PREFIX)
         }
-        if set(values) | {"clearance", "attached", "pin_place"} != names:
+        if set(values) | {"clearance", "attached"} | _OPTIONAL != names:
             raise ValueError(
                 f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
                 f"got {', '.join(sorted(values))}."

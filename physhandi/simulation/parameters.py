@@ -33,7 +33,7 @@ Effect = Literal["live", "material", "topology", "step", "world"]
 scales the fitted springs; ``topology`` lays the springs anew; ``step`` needs another simulator;
 ``world`` only decides what `SimulationParameters.in_world` takes from a recording."""
 
-SliderGroup = Literal["springs", "more", "ground", "self-collision"]
+SliderGroup = Literal["springs", "more", "ground", "self-collision", "hands"]
 SliderScale = Literal["linear", "power", "relative power"]
 
 
@@ -347,6 +347,44 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
         ),
     ] = False
     """Whether nodes collide that are nearer than `collision_distance` at frame 0 (PhysTwin)."""
+    hand_pushes: Annotated[
+        bool,
+        Role(
+            label="hands push",
+            slider=Slider(
+                group="hands",
+                hint="The surface of the hands pushes object nodes that they do not hold.",
+            ),
+        ),
+    ] = False
+    """Whether the surface of the hands pushes object nodes that no virtual spring holds."""
+    push_stiffness: Annotated[
+        float,
+        Meta(ge=0.0, le=1e8),
+        Role(
+            label="push stiffness",
+            slider=Slider(
+                group="hands",
+                hint="Push of a hand on a node, for each metre that the node is inside of it.",
+                step=0.05,
+                scale="relative power",
+            ),
+        ),
+    ] = 1e5
+    """Push of a hand on a node, for each metre that the node is inside of it [N/m]."""
+    hand_friction: Annotated[
+        float,
+        Meta(ge=0.0, le=2.0),
+        Role(
+            label="friction of hands",
+            slider=Slider(
+                group="hands",
+                hint="How much nodes that a hand pushes resist sliding along it; 0 is wet soap.",
+                step=0.05,
+            ),
+        ),
+    ] = 0.5
+    """Coulomb friction coefficient between a node and the hand that pushes it."""
     speed_limit: Annotated[
         float,
         Meta(ge=1e-3, le=1e6),
@@ -360,6 +398,11 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             super().__post_init__()
         except SettingsError as error:
             raise _of_parameters(error) from None
+
+    @property
+    def has_contacts(self) -> bool:
+        """Whether nodes collide with each other or with hands, which no batch simulates."""
+        return self.self_collision or self.hand_pushes
 
     @property
     def simulated_frame_rate(self) -> float:

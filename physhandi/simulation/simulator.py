@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.cuda import CudaEngine
 from physhandi.simulation.engines.graph import LaunchGraph, SpringSums
 from physhandi.simulation.engines.rod_force import RodForce
+from physhandi.simulation.hand_contact import HandContact
 from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
@@ -44,8 +46,9 @@ class Rollout:
 class Simulator:
     """Simulates one model; holds model and state on a device.
 
-    An engine advances a frame in one launch; with self-collision, for a rope that bends, or where
-    the engine does not fit, a frame is captured as a graph of two to four kernels a substep.
+    An engine advances a frame in one launch; with self-collision, with hands that push, for a rope
+    that bends, or where the engine does not fit, a frame is captured as a graph of two to five
+    kernels a substep.
     Everything tunable lives in device arrays, so that both see changes. The same input gives the
     same bits, run after run.
     """
@@ -77,8 +80,10 @@ class Simulator:
         self._held: ndarray | None = None
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
         self._collision: SelfCollision | None = None
+        self._hand_contact: HandContact | None = None
         self._recordings = {
-            collides: LaunchGraph(self._launch_frame, self.device) for collides in (False, True)
+            laws: LaunchGraph(self._launch_frame, self.device)
+            for laws in product((False, True), repeat=2)
         }
         self.set_parameters(parameters)
 
@@ -150,6 +155,8 @@ class Simulator:
         self.rest_length.assign(self.model.rest_length)
         self.clearance.assign(self.model.clearance)
         self.first_divergence.fill_(NO_DIVERGENCE)
+        if self.hand_contact is not None:
+            self.hand_contact.shift(None)
         if self.rod is not None:
             self.rod.reset()
 
@@ -175,6 +182,8 @@ class Simulator:
         self.reset(restart.position, restart.velocity)
         self.rest_length.assign(model.rest_length)
         self.clearance.assign(model.clearance)
+        if self.hand_contact is not None:
+            self.hand_contact.shift(shift)
         return shift
 
     def step_frame(
@@ -264,18 +273,24 @@ class Simulator:
 
     def replay_frame(self) -> None:
         """Advance the state on the device by one frame, with the controls on the device."""
-        if self.collision is None and self.engine is not None:
+        if not self.has_contacts and self.engine is not None:
             state = self.position, self.velocity
             self.engine.advance(state, state)
             return
         # Arrays of the launches cannot be allocated during capture.
         _ = self.sums, self.rod
         version = self.find_candidates(self.position)
-        self._recordings[self.parameters.self_collision].replay(version)
+        laws = self.collision is not None, self.hand_contact is not None
+        self._recordings[laws].replay(version)
+
+    @property
+    def has_contacts(self) -> bool:
+        """Whether nodes collide with each other or with hands, which no engine computes."""
+        return self.collision is not None or self.hand_contact is not None
 
     @cached_property
     def engine(self) -> CudaEngine | CpuEngine | None:
-        """Engine for frames without self-collision, if one fits; built on first use."""
+        """Engine for frames without such contacts, if one fits; built on first use."""
         if self.model.rod is not None:
             return None
         return CudaEngine.of(self) or CpuEngine.of(self)
@@ -309,8 +324,18 @@ class Simulator:
             self._collision = SelfCollision(self.model.object_node, self.clearance, self.world)
         return self._collision
 
+    @property
+    def hand_contact(self) -> HandContact | None:
+        """Surface of the hands that pushes nodes; None while off, or if there is no surface."""
+        if not self.parameters.hand_pushes or not len(self.model.hand_face):
+            return None
+        if self._hand_contact is None:
+            rate = self.parameters.simulated_frame_rate
+            self._hand_contact = HandContact(self.model, self.world, rate)
+        return self._hand_contact
+
     def find_candidates(self, position: wp.array) -> int:
-        """Find which nodes may collide in the frame that starts at `position`.
+        """Find which nodes may collide in the frame that starts at `position`, and with what.
 
         Returns:
             A number that changes when launches on the candidates must be recorded again.
@@ -318,6 +343,8 @@ class Simulator:
         Raises:
             SimulationError: If there are too many.
         """
+        if self.hand_contact is not None:
+            self.hand_contact.find(position, self.control_start, self.stiffness)
         collision = self.collision
         if collision is None:
             return 0
@@ -347,16 +374,10 @@ class Simulator:
                 used with self-collision only.
         """
         fraction = (substep + 1) / self.parameters.substeps_per_frame
-        wp.launch(
-            pull_springs,
-            dim=len(self.model.spring_nodes),
-            inputs=self.spring_inputs(fraction, before),
-            outputs=[self.sums.pull],
-            device=self.device,
-        )
-        if self.rod is not None:
-            self.rod.launch(fraction, self.world, [*before, *self.controls], self.sums.pull)
-        start, entry, value = self.sums.of(self.sums.pull, self.sums.row_pull)
+        rows = self.launch_springs(fraction, before)
+        if self.hand_contact is not None:
+            rows = self.hand_contact.launch_push(fraction, rows, before, self.controls)
+        start, entry, value = rows
         collision = self.collision
         if collision is not None:
             collision.launch_free(start, entry, before[1], value, free_velocity)
@@ -372,6 +393,25 @@ class Simulator:
             outputs=[tape, *after, self.first_divergence],
             device=self.device,
         )
+
+    def launch_springs(
+        self, fraction: float, state: tuple[wp.array, wp.array]
+    ) -> tuple[wp.array, wp.array, wp.array]:
+        """Launch the forces of springs, and of a rope that bends, a `fraction` of a frame on.
+
+        Returns:
+            Sums of the forces, as arguments of `spring_sum`.
+        """
+        wp.launch(
+            pull_springs,
+            dim=len(self.model.spring_nodes),
+            inputs=self.spring_inputs(fraction, state),
+            outputs=[self.sums.pull],
+            device=self.device,
+        )
+        if self.rod is not None:
+            self.rod.launch(fraction, self.world, [*state, *self.controls], self.sums.pull)
+        return self.sums.of(self.sums.pull, self.sums.row_pull)
 
     def check_divergence(self, frame: int) -> None:
         """Raise `SimulationDivergedError` if the last frame recorded a divergence."""
@@ -427,6 +467,8 @@ def world_array(parameters: Sequence[SimulationParameters]) -> ndarray:
             "self_restitution": each.self_restitution,
             "self_friction": each.self_friction,
             "collides_rest_neighbors": each.collides_rest_neighbors,
+            "push_stiffness": each.push_stiffness,
+            "hand_friction": each.hand_friction,
             "speed_limit": each.speed_limit,
         }
         for name, value in values.items():

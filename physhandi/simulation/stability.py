@@ -34,8 +34,8 @@ def largest_stable_step(
 
     A mode with stiffness k and damping c (unit mass) is stable if ``dt² k + 2 dt c < 4``. For a
     guess of dt, Lanczos iterations find the mode of all springs at frame 0 for which the left
-    side is largest; the dt at which it reaches 4 is the next guess. Contact, drag and large
-    rotations are not included.
+    side is largest; the dt at which it reaches 4 is the next guess. Hands that push may push every
+    node; other contact, drag and large rotations are not included.
 
     What is found is never below the true limit, so `stable_substeps` adds a margin. Each guess
     takes 20 products with the operator; from a random start those miss the largest
@@ -210,6 +210,11 @@ class _SpringOperator:
             }
             for each in rate.values():
                 each[late] = 0.0
+        if parameters.hand_pushes and len(model.hand_face):
+            # A node is pushed by one triangle at a time, in whichever direction; what that
+            # dissipates is implicit.
+            pushed = anchor["stiffness"] + parameters.push_stiffness
+            anchor = {"stiffness": pushed, "damping": anchor["damping"]}
         shape = (len(row_end) - 1, 3 * count)
         stretch = csr_array((value, column, row_end), shape=shape)
         if model.rod is not None:

@@ -369,6 +369,7 @@ class SteeredMotion:
             model=replace(
                 model,
                 control_count=model.control_count + 1,
+                hand_face=model.hand_face + np.int32(model.hand_face >= own),
                 spring_nodes=ends + np.int32(ends >= model.node_count + own),
             ),
             control=control,
@@ -394,7 +395,10 @@ class SteeredMotion:
         return replace(
             free,
             model=replace(
-                model, spring_nodes=place[model.spring_nodes], control_count=len(remaining)
+                model,
+                spring_nodes=place[model.spring_nodes],
+                control_count=len(remaining),
+                hand_face=model.hand_face_of(remaining),
             ),
             control=self.control[remaining],
             hands=tuple(

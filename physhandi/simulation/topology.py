@@ -197,7 +197,7 @@ def retopologize(
         contacts: What touches, and when; see `build_model`.
 
     Returns:
-        The new model, with the initial velocity and the clearance of the old one.
+        The new model, with the initial velocity, the clearance and the hands of the old one.
     """
     built = build_model(model.object_node, control_0, parameters, rest_node, contacts, model.rod)
     key, fitted_key = _spring_keys(built), _spring_keys(model)
@@ -218,6 +218,7 @@ def retopologize(
         damping=damping,
         initial_velocity=model.initial_velocity,
         clearance=model.clearance,
+        hand_face=model.hand_face,
     )
 
 

@@ -10,10 +10,11 @@ from support.viewer.viewer_world import PARAMETERS, make_run
 
 from app.settings import BUNDLED
 from physhandi.data.layout import SequenceFiles
-from physhandi.errors import RunError
+from physhandi.errors import RunError, UsageError
 from physhandi.fitted_object import FittedObject
-from physhandi.object_rollout import load_fitted, load_surface
+from physhandi.object_rollout import ObjectRollout, load_fitted, load_surface
 from physhandi.run import Run
+from physhandi.simulation.edits import Release
 from physhandi.simulation.forces import spring_strains
 from physhandi.simulation.restart import SHORTEST_SHARE, Restart
 from physhandi.simulation.simulator import Simulator
@@ -239,6 +240,31 @@ def test_a_damaged_restart_is_named(restarted, tmp_path: Path) -> None:
     save_file(shorter, run.out / SequenceFiles("lift").restart)
     with pytest.raises(RunError, match=r"restart\.safetensors.*position has 5 nodes"):
         FittedObject.of(run, "lift")
+
+
+def test_hands_push_what_they_do_not_hold() -> None:
+    """A run that was stored before hands could push has their triangles beside its model."""
+    object_ = FittedObject.of(BUNDLED / "runs" / "towel_fold_quick")
+    model, hand = object_.model, object_.scene().hands["right"]
+    np.testing.assert_array_equal(model.hand_face, hand.face)
+    np.testing.assert_allclose(object_.fitted.control[7], hand.vertex[7], atol=1e-6)
+    # The hand goes 2 cm lower than it did, into a towel that it does not hold.
+    control = object_.fitted.control[:25] - np.float32([0.0, 0.0, 0.02])
+    low = FittedObject(ObjectRollout.empty(model, object_.parameters, control))
+    free = [Release(nodes=tuple(range(model.node_count)))]
+    still = low.simulate(edits=free)
+    pushed = low.simulate(edits=free, hand_pushes=True)
+    lying = still.position[-1] - still.position[0]
+    assert np.linalg.norm(lying[:, :2], axis=1).max() < 0.005
+    moved = np.linalg.norm(pushed.position[-1] - still.position[-1], axis=1)
+    assert 0.02 < moved.max() < 0.08
+    # What is far from the hand stays.
+    assert np.quantile(moved, 0.25) < 0.005
+
+
+def test_hands_without_a_surface_cannot_push(fitted) -> None:
+    with pytest.raises(UsageError, match="hand_pushes needs the surface of a hand"):
+        fitted.simulate(hand_pushes=True)
 
 
 def test_the_surface_has_the_colors_of_the_first_frame(tmp_path: Path) -> None:

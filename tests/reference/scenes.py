@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from reference.spring_mass import Scene
+from scipy.spatial.transform import Rotation
 
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -142,6 +143,61 @@ def crossing_scene(**changes):
     return in_float32(replace(scene, **changes))
 
 
+def ball(center, radius):
+    """Give an octahedron whose sides are split once: 18 corners, 32 triangles seen from outside."""
+    corners = [np.eye(3)[axis] * sign for axis in range(3) for sign in (1.0, -1.0)]
+    faces = []
+    for x, y, z in [(x, y, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]:
+        turned = (x + y + z) % 2 == 0
+        faces.append((x, y, z) if turned else (x, z, y))
+    middles, split = {}, []
+    for a, b, c in faces:
+        ab, bc, ca = (
+            middles.setdefault(frozenset(pair), 6 + len(middles))
+            for pair in ((a, b), (b, c), (c, a))
+        )
+        split += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    points = np.array([*corners, *(np.mean([corners[i] for i in pair], 0) for pair in middles)])
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return np.asarray(center) + radius * points, np.array(split)
+
+
+def pressed_scene(**changes):
+    """Let a turning ball push a springy sheet of sixteen nodes down to the ground.
+
+    The ball comes from above and from the side, turns by 0.25 rad a frame and holds one node.
+    """
+    rng = np.random.default_rng(5)
+    node = np.array([[0.012 * i, 0.012 * j, 0.0] for i in range(4) for j in range(4)])
+    node += rng.normal(0, 0.0006, node.shape) + np.array([0.0, 0.0, 0.003])
+    point, face = ball([0.019, 0.016, 0.0], 0.02)
+    springs = [(i, j) for i in range(16) for j in range(i + 1, 16)
+               if np.linalg.norm(node[i] - node[j]) < 0.019]  # fmt: skip
+    control = []
+    for frame in range(4):
+        turn = Rotation.from_rotvec([0.1 * frame, 0.25 * frame, 0.05 * frame])
+        middle = np.array([0.019, 0.016, 0.0])
+        way = np.array([0.004 * frame, 0.001 * frame, 0.0215 - 0.0025 * frame])
+        control.append(turn.apply(point - middle) + middle + way)
+    springs = np.array([*springs, (0, 16 + 7)])
+    ends = np.vstack([node, control[0]])[springs]
+    scene = Scene(
+        node=node,
+        velocity=rng.normal(0, 0.02, node.shape),
+        springs=springs,
+        rest=np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1),
+        stiffness=rng.uniform(2, 4, len(springs)),
+        damping=rng.uniform(0.1, 0.3, len(springs)),
+        control=np.array(control),
+        substeps=40,
+        hand=face,
+        gravity=1.0,
+        push_stiffness=5e4,
+        hand_friction=0.4,
+    )
+    return in_float32(replace(scene, **changes))
+
+
 def in_float32(scene):
     """Round every array to float32, but keep float64."""
     arrays = ["node", "velocity", "rest", "stiffness", "damping", "control"]
@@ -167,6 +223,9 @@ def as_model(scene):
         self_restitution=scene.self_restitution,
         self_friction=scene.self_friction,
         collides_rest_neighbors=scene.blocks_rest,
+        hand_pushes=scene.hand is not None,
+        push_stiffness=scene.push_stiffness,
+        hand_friction=scene.hand_friction,
     )
     is_object = np.all(scene.springs < len(scene.node), axis=1)
     assert np.all(np.diff(is_object.astype(int)) <= 0), "object springs come first"
@@ -180,6 +239,7 @@ def as_model(scene):
         object_spring_count=int(is_object.sum()),
         control_count=scene.control.shape[1],
         clearance=np.float32([0.0] if scene.clearance is None else scene.clearance),
+        **({} if scene.hand is None else {"hand_face": scene.hand.astype(np.int32)}),
         **({} if scene.attached is None else {"attached": np.int32(scene.attached)[~is_object]}),
     )
     return model, parameters

@@ -33,6 +33,10 @@ class Scene:
     blocks_rest: bool = False  # rest neighbours collide too
     rest_shape: np.ndarray | None = None  # object nodes at rest; none for `node`
     attached: np.ndarray | None = None  # (spring, 2): the states between which each spring acts
+    hand: np.ndarray | None = None  # triangles of control nodes that push; none switches it off
+    push_stiffness: float = 1e5
+    hand_friction: float = 0.5
+    beside: list | None = None  # of every frame, what `triangles_beside` gave; none to find it
 
 
 def incidence(scene, count):
@@ -109,10 +113,76 @@ def collisions(scene, may, x, v):
     return v - total / np.maximum(count, 1)[..., None], count.sum(-1) // 2
 
 
-def simulate(scene, counts=None):
+def nearest_of(corners, point):
+    """Weights of a triangle's point nearest to a point, and how far that is, by least squares."""
+    best = None
+    for chosen in ([0, 1, 2], [0, 1], [0, 2], [1, 2], [0], [1], [2]):
+        base, sides = corners[chosen[0]], (corners[chosen[1:]] - corners[chosen[0]]).T
+        part = np.linalg.lstsq(sides, point - base, rcond=None)[0]
+        weight = np.zeros(3)
+        weight[chosen] = [1.0 - part.sum(), *part]
+        if weight.min() >= 0.0:
+            gap = np.linalg.norm(point - weight @ corners)
+            if best is None or gap < best[1]:
+                best = weight, gap
+    return best
+
+
+def triangles_beside(scene, x, place):
+    """Which triangle may push each node in a frame that starts like this (-1: none), and where."""
+    held = {min(ends) for ends, k in zip(scene.springs, scene.stiffness, strict=True)
+            if max(ends) >= len(x) and k > 0.0}  # fmt: skip
+    number, weights = np.full(len(x), -1), np.zeros((len(x), 3))
+    for node in set(range(len(x))) - held:
+        each = []
+        for face in scene.hand:
+            corners = place[face]
+            weight, gap = nearest_of(corners, x[node])
+            normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+            height = (x[node] - corners[0]) @ normal / np.linalg.norm(normal)
+            size = max(np.linalg.norm(corners[i] - corners[i - 1]) for i in range(3))
+            each.append((gap, height, size, weight))
+        least = min(gap for gap, *_ in each)
+        same = [i for i, (gap, *_) in enumerate(each) if gap**2 <= least**2 * (1 + 1e-4)]
+        best = max(same, key=lambda i: abs(each[i][1]))
+        gap, height, size, weight = each[best]
+        aside = np.sqrt(max(gap**2 - height**2, 0.0))
+        if gap < 6 * size and height > -3 * size and aside < 0.7 * size:
+            number[node], weights[node] = best, weight
+    return number, weights
+
+
+def pushes(scene, beside, state, force, held, rate):
+    """Force of the hand on every object node; `force` is that of springs, `rate` the hand's."""
+    x, v = state
+    dt = 1.0 / (scene.frame_rate * scene.substeps)
+    number, weight = beside
+    pushed = np.flatnonzero(number >= 0)
+    first, second, third = (held[..., scene.hand[number[pushed], i], :] for i in range(3))
+    normal = np.cross(second - first, third - first)
+    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    depth = -((x[..., pushed, :] - first) * normal).sum(-1)
+    surface = sum(
+        weight[pushed, i, None] * rate[..., scene.hand[number[pushed], i], :] for i in range(3)
+    )
+    slip = v[..., pushed, :] + dt * (force[..., pushed, :] - [0.0, 0.0, scene.gravity]) - surface
+    leaving = (slip * normal).sum(-1)
+    # The force that it has with the velocity that it leads to: N = q (1 - (u + dt N) / 0.1 m/s).
+    load = scene.push_stiffness * np.maximum(depth, 0.0)
+    size = np.maximum((load - load * leaving / 0.1) / (1.0 + dt * load / 0.1), 0.0)
+    sliding = slip - leaving[..., None] * normal
+    speed = np.maximum(np.linalg.norm(sliding, axis=-1), 1e-6)
+    grip = np.minimum(scene.hand_friction * size, speed / dt)
+    total = np.zeros(np.broadcast_shapes(x.shape, v.shape))
+    total[..., pushed, :] = size[..., None] * normal - (grip / speed)[..., None] * sliding
+    return total
+
+
+def simulate(scene, counts=None, beside=None):
     """Positions and velocities of the object nodes at every frame.
 
-    A list given as `counts` gets the number of colliding pairs of every substep. Cases come first.
+    A list given as `counts` gets the number of colliding pairs of every substep, one given as
+    `beside` the triangles that may push in every frame. Cases come first.
     """
     dt = 1.0 / (scene.frame_rate * scene.substeps)
     shape = (*cases(scene), *scene.node.shape[-2:])
@@ -136,9 +206,18 @@ def simulate(scene, counts=None):
             )
         rate = (end - start) * scene.frame_rate * scene.moves
         may = None if scene.distance is None else candidate_table(scene, x)
+        near = None
+        if scene.hand is not None:
+            given = scene.beside
+            near = triangles_beside(scene, x, start) if given is None else given[frame]
+            if beside is not None:
+                beside.append(near)
         for substep in range(scene.substeps):
             held = start + (end - start) * (substep + 1) / scene.substeps
             force = spring_force(scene, joins, joined(x, held), joined(v, rate))[..., :count, :]
+            if near is not None:
+                moving = (end - start) * scene.frame_rate
+                force = force + pushes(scene, near, (x, v), force, held, moving)
             free = (v + dt * (force + weight)) * drag
             if may is not None:
                 free, collided = collisions(scene, may, x, free)

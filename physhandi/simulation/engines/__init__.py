@@ -6,7 +6,8 @@ Every engine integrates the same laws; it writes them once, in the form in which
 engine              spring law                     why it has its own
 ==================  =============================  ================================================
 `graph` (any        `kernels.springs`, derivative  One launch a law, springs first and then nodes:
-device)             in `kernels.adjoint`           the reference, and the way of self-collision
+device)             in `kernels.adjoint`           the reference, and the way of self-collision,
+                                                   of hands that push (`kernels.hand_contact`)
                                                    and of ropes that bend (`kernels.rod`).
 `cpu`               `kernels.simd`                 Eight springs at a time by the vector units,
                                                    which Warp's own CPU code does not use.

@@ -598,8 +598,11 @@ class BatchSimulator:
         for name in _COMMON:
             if len({getattr(p, name) for p in parameters}) > 1:
                 raise UsageError(f"All candidates of a batch must have the same {name}.")
-        if any(p.self_collision for p in parameters):
-            raise UsageError("Self-collision is not simulated in a batch; switch it off.")
+        if any(p.has_contacts for p in parameters):
+            raise UsageError(
+                "Neither self-collision nor hands that push are simulated in a batch; switch off "
+                "self_collision and hand_pushes."
+            )
         self.master = master
         self.parameters = tuple(parameters)
         self.substeps = max(p.substeps_per_frame for p in parameters)

@@ -329,7 +329,7 @@ class CpuAdjoint:
     @staticmethod
     def of(simulator: EngineHost, engine: Any) -> "CpuAdjoint | None":
         """Create one for a simulator; None with another engine or with self-collision."""
-        if not isinstance(engine, CpuEngine) or simulator.parameters.self_collision:
+        if not isinstance(engine, CpuEngine) or simulator.has_contacts:
             return None
         return CpuAdjoint(simulator, engine)
 

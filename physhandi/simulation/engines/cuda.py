@@ -434,7 +434,7 @@ class CudaAdjoint:
     @staticmethod
     def of(simulator: EngineHost, engine: Any) -> "CudaAdjoint | None":
         """Create one for a simulator; None with another engine, or if its blocks do not fit."""
-        if not isinstance(engine, CudaEngine) or simulator.parameters.self_collision:
+        if not isinstance(engine, CudaEngine) or simulator.has_contacts:
             return None
         partition, layout = engine.partition, engine.layout
         fits = partition.most_locals <= ADJOINT_LOCALS and layout.holds(partition)

@@ -81,7 +81,10 @@ class GraphAdjoint:
             self._copied = tape
         for value in self.sums:
             value.zero_()
-        self._adjoint.replay(self._simulator.find_candidates(self._position[0]))
+        version = self._simulator.find_candidates(self._position[0])
+        if self._simulator.hand_contact is not None:
+            self._simulator.hand_contact.list_corners()
+        self._adjoint.replay(version)
 
     def _launch_fill(self) -> None:
         for substep, tapes in enumerate(
@@ -112,6 +115,15 @@ class GraphAdjoint:
                 )
             else:
                 self._launch_contacts(substep, collision)
+            if simulator.hand_contact is not None:
+                simulator.hand_contact.launch_adjoint(
+                    fraction,
+                    simulator.launch_springs(fraction, state),
+                    state,
+                    simulator.controls,
+                    [*state_bars, self._force_bar],
+                    self.sums.controls,
+                )
             wp.launch(
                 springs_adjoint,
                 dim=len(model.spring_nodes),

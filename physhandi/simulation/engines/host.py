@@ -41,3 +41,8 @@ class EngineHost(FrameHost, Protocol):
     model: SpringMassModel
     position: wp.array
     velocity: wp.array
+
+    @property
+    def has_contacts(self) -> bool:
+        """Whether nodes collide with each other or with hands, which no engine computes."""
+        ...

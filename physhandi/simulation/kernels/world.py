@@ -22,5 +22,8 @@ class World:
     self_restitution: wp.float32
     self_friction: wp.float32
     collides_rest_neighbors: wp.int32
+    push_stiffness: wp.float32
+    """Push of a hand on a node, for each metre that the node is inside of it [N/m]."""
+    hand_friction: wp.float32
     speed_limit: wp.float32
     """A node that is faster has diverged [m/s]."""

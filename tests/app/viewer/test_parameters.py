@@ -83,6 +83,18 @@ def test_self_collision_is_a_box_and_its_sliders() -> None:
     assert text == "nodes collide off → on, distance [mm] 5 → 8, friction of nodes 0.3 → 1"
 
 
+def test_hands_that_push_are_a_box_and_their_sliders() -> None:
+    box, stiffness, friction = knobs_of("hands", START, length_unit="m")
+    on = START.replace(hand_pushes=True, push_stiffness=1e6, hand_friction=1.5)
+    assert (box.to_slider(START), box.to_slider(on)) == (False, True)
+    assert stiffness.from_slider(stiffness.to_slider(on)) == pytest.approx(1e6)
+    assert friction.to_slider(on) == 1.5
+    assert stiffness.to_slider(START) == 0.0
+    slippery = START.replace(hand_pushes=True, hand_friction=0.0)
+    text = what_changed((box, friction), START, slippery)
+    assert text == "hands push off → on, friction of hands 0.5 → 0"
+
+
 def test_the_ground_is_a_box_and_its_height() -> None:
     box, height, *_ = ground_knobs(START, length_unit="m", low=0.01, high=0.2)
     none = START.replace(ground_height=None)

@@ -263,6 +263,8 @@ def test_what_must_be_common_and_what_a_batch_cannot_do_are_refused():
         BatchSimulator(master, [BASE, BASE.replace(rest_length_floor=2e-3)])
     with pytest.raises(UsageError, match=r"[Ss]elf-collision"):
         BatchSimulator(master, [BASE.replace(self_collision=True)])
+    with pytest.raises(UsageError, match="hand_pushes"):
+        BatchSimulator(master, [BASE.replace(hand_pushes=True)])
     with pytest.raises(ValueError, match="control"):
         BatchSimulator(master, [BASE]).rollout(control[:, :1])
 

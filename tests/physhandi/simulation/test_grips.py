@@ -142,8 +142,11 @@ def test_pins_stay_where_they_are_beside_points_and_hands() -> None:
         attached=np.concatenate([pinned.attached, pinned.attached[:1]]),
     )
     control = np.concatenate([motion.control, motion.start[0][[4]]])
+    pinned = replace(pinned, hand_face=np.int32([[0, 1, 2], [2, 1, 3]]))
     with_pin = replace(motion, model=pinned, control=control)
     held = with_pin.hold_point(24, motion.start, motion.pose[0], "point 1")
+    # The new point has the number of the pin, which has one more; it is no part of a hand.
+    np.testing.assert_array_equal(held.model.hand_face, [[0, 1, 2], [2, 1, 4]])
     assert pairs(held) - {(24, 3), (19, 3), (23, 3)} == pairs(motion) | {(4, 4)}
     pose = np.full((3, POSE), 0.01)
     np.testing.assert_array_equal(held.control_at(pose)[4], motion.start[0][4])
@@ -152,6 +155,7 @@ def test_pins_stay_where_they_are_beside_points_and_hands() -> None:
     back = held.without_point(2, held.start, held.pose[0])
     assert pairs(back) == pairs(with_pin)
     np.testing.assert_array_equal(back.control, control)
+    np.testing.assert_array_equal(back.model.hand_face, pinned.hand_face)
     with pytest.raises(ValueError, match="can move"):
         replace(with_pin, hands=(replace(motion.hands[0], control=np.array([3])), motion.hands[1]))
 

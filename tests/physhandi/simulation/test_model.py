@@ -127,6 +127,16 @@ def test_a_model_stored_before_nodes_had_a_clearance_has_none():
     assert old.clearance.dtype == np.float32
 
 
+def test_the_surface_of_hands_is_stored_if_there_is_one():
+    model, _ = as_model(cube_scene())
+    assert "hand_face" not in model.to_tensors()
+    handed = replace(model, hand_face=np.int32([[0, 1, 2], [1, 3, 2]]))
+    again = SpringMassModel.from_tensors(load(save(handed.to_tensors())))
+    np.testing.assert_array_equal(again.hand_face, [[0, 1, 2], [1, 3, 2]])
+    # Of control nodes 3, 1 and 2, in this order, one triangle is left.
+    np.testing.assert_array_equal(handed.hand_face_of(np.array([3, 1, 2])), [[1, 0, 2]])
+
+
 def test_a_model_without_one_of_its_arrays_is_refused():
     tensors = as_model(cube_scene())[0].to_tensors()
     del tensors["damping"]
@@ -149,6 +159,7 @@ def test_a_model_without_one_of_its_arrays_is_refused():
             lambda _: {"object_spring_count": 99},
             "object_spring_count is 99, but there are 33 springs",
         ),
+        (lambda _: {"hand_face": np.int32([[0, 1, 4]])}, r"hand_face .* outside 0…3"),
     ],
 )
 def test_an_inconsistent_model_is_refused(change, message):

@@ -127,7 +127,7 @@ def test_every_number_of_it_acts_without_another_capture(device):
     before = crossing_scene()
     simulator = Simulator(*as_model(before), device=device)
     simulator.rollout(before.control)
-    graph = simulator._recordings[True].graph
+    graph = simulator._recordings[True, False].graph
     after = replace(
         before, distance=0.025, self_restitution=0.1, self_friction=1.2, blocks_rest=True
     )
@@ -135,7 +135,7 @@ def test_every_number_of_it_acts_without_another_capture(device):
     np.testing.assert_allclose(
         simulator.rollout(after.control).position, simulate(after)[0], atol=2e-7
     )
-    assert simulator._recordings[True].graph is graph
+    assert simulator._recordings[True, False].graph is graph
     assert np.abs(simulate(after)[0] - simulate(before)[0]).max() > 1e-3
 
 
@@ -149,7 +149,7 @@ def test_switched_off_it_leaves_no_trace(device):
     expected = never.rollout(off.control)
     assert simulator.rollout(off.control).position.tobytes() == expected.position.tobytes()
     assert never.collision is None
-    assert never._recordings[True].graph is None
+    assert never._recordings[True, False].graph is None
     simulator.set_parameters(as_model(scene)[1])
     assert simulator.rollout(scene.control).position.tobytes() == on.position.tobytes()
     assert on.position.tobytes() != expected.position.tobytes()
@@ -198,11 +198,11 @@ def test_more_candidates_than_there_is_room_for_make_room(device, monkeypatch):
     monkeypatch.setattr(self_collision, "FIRST_CAPACITY", 1)
     simulator = Simulator(*as_model(replace(scene, distance=0.004)), device=device)
     simulator.rollout(scene.control)
-    graph = simulator._recordings[True].graph
+    graph = simulator._recordings[True, False].graph
     simulator.set_parameters(as_model(scene)[1])
     grown = simulator.rollout(scene.control)
     assert len(simulator.collision.candidate) > 300
-    assert simulator._recordings[True].graph is not graph
+    assert simulator._recordings[True, False].graph is not graph
     assert grown.position.tobytes() == expected.position.tobytes()
     assert np.abs(expected.position[4] - expected.position[0]).max() > 0.01
 

@@ -240,13 +240,13 @@ def test_tunables_act_without_another_capture(device):
     model, parameters = as_model(before)
     simulator = Simulator(model, parameters, device=device)
     simulator.rollout(before.control)
-    graph = simulator._recordings[False].graph
+    graph = simulator._recordings[False, False].graph
     simulator.set_parameters(as_model(after)[1].replace(stiffness_scale=2.0))
     simulator.set_material(stiffness=model.stiffness / 3.0, damping=model.damping * 2.0)
     changed = simulator.rollout(after.control)
     oracle = replace(after, stiffness=after.stiffness * 2.0 / 3.0, damping=after.damping * 2.0)
     np.testing.assert_allclose(changed.position, simulate(oracle)[0], atol=2e-7)
-    assert simulator._recordings[False].graph is graph
+    assert simulator._recordings[False, False].graph is graph
 
 
 def test_only_what_moves_the_nodes_is_laid_out(device):
