@@ -22,7 +22,6 @@ from physhandi.data.attempt import Attempt, ResultStore
 from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.files import json_line
-from physhandi.data.hand_surface import stored_faces
 from physhandi.data.layout import (
     MATERIAL_FILE,
     METRICS_FILE,
@@ -75,6 +74,7 @@ from physhandi.fitting.observed.track_registration import with_late_tracks
 from physhandi.fitting.placement import (
     bends_as_rod,
     control_trajectory_of,
+    hand_faces,
     object_nodes_of,
     refine_sequence,
     store_refined,
@@ -498,6 +498,14 @@ def _prepare(
     if not stages[EVALUATION].is_ready:
         raise MissingInputError(nothing_to_fit(sequences))
     for sequence in sequences:
+        moves_by_points = sequence.control is not None or config.control_nodes != "all"
+        if config.simulation.hand_pushes and moves_by_points:
+            raise MissingInputError(
+                f"Sequence '{sequence.name}' has no hand whose surface could push: single points "
+                "move its object (control.npy, or control_nodes). Switch simulation.hand_pushes "
+                "off."
+            )
+    for sequence in sequences:
         artefacts.save_sequence_meta(attempt, sequence)
     _stage_hands(sequences, config, attempt, progress, keeper)
     if stages[OBSERVATION].is_ready:
@@ -580,6 +588,8 @@ def _problems(
             )
         observation = _followed(attempt, sequence, object_node, config.object_)
         control = artefacts.load_control(attempt.out, sequence.name)
+        motions = artefacts.load_motions(attempt.out, sequence.name)
+        hand_face = hand_faces(motions, control.shape[1])
         contacts = None
         if follows_contact:
             ground = None
@@ -604,7 +614,7 @@ def _problems(
                 object_node=object_node,
                 rest_node=rest_node,
                 control=control,
-                hand_face=stored_faces(attempt.out, sequence.name, control.shape[1]),
+                hand_face=hand_face,
                 contacts=contacts,
                 frame_count=len(sequence.reconstruction_frames),
                 frame_rate=sequence.frame_rate,

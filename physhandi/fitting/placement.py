@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Int32
 from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
@@ -124,17 +124,15 @@ def place_object(
         ground_height=sequence.ground_height,
         gravity=sequence.gravity,
     )
-    no_hands = joined_faces((), 0)
     laid = replace(
         fitted_model,
         object_node=node,
         initial_velocity=velocity,
         clearance=clearance,
-        hand_face=no_hands,
+        hand_face=joined_faces((), 0),
     )
     model = retopologize(laid, world, control[0], fitted=parameters, rest_node=rest_node)
-    surfaces = [(hand.vertex_count, hand.faces) for hand in _hand_models(motions)]
-    model = replace(model, hand_face=joined_faces(surfaces, control.shape[1]))
+    model = replace(model, hand_face=hand_faces(motions, control.shape[1]))
     model = gripped(model)
     if is_bent and np.array_equal(rest_node, fitted_model.object_node):
         # The shape at frame 0 was its rest shape, in which springs carried it; so here.
@@ -239,6 +237,12 @@ def control_trajectory_of(
     vertex = control_trajectory(motions, models)
     chosen = _chosen_vertices(sequence, vertex[0], models, config)
     return vertex if chosen is None else vertex[:, chosen]
+
+
+def hand_faces(motions: tuple[HandMotion, ...], control_count: int) -> Int32[ndarray, "all_face 3"]:
+    """Give the triangles of hands by control nodes; see `joined_faces`."""
+    surfaces = [(model.vertex_count, model.faces) for model in _hand_models(motions)]
+    return joined_faces(surfaces, control_count)
 
 
 def bends_as_rod(sequences: Listing[Sequence], config: PipelineConfig) -> bool:

@@ -278,6 +278,14 @@ def test_a_sequence_with_nothing_to_fit_says_what_is_missing(
         pipeline.run_job(run)
 
 
+def test_points_that_move_an_object_cannot_push_it(tmp_path: Path, recordings: Path) -> None:
+    pushing = small_config().replace(simulation=small_config().simulation.replace(hand_pushes=True))
+    run = new_run(tmp_path / "pushing", [recordings / "low"], pushing.to_dict())
+    with pytest.raises(MissingInputError, match="'low' has no hand whose surface could push"):
+        pipeline.run_job(run)
+    assert not list((run.folder / "attempts").glob("*/out/sequences"))
+
+
 def test_a_run_without_an_object_cannot_be_simulated(tmp_path: Path, recordings: Path) -> None:
     empty = new_run(tmp_path / "empty", [recordings / "low"])
     empty.begin_attempt().publish()

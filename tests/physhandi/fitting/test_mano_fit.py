@@ -160,7 +160,9 @@ def test_a_whole_run_refines_mano_goes_on_after_a_stop_and_outlives_mano(
     assert vertex.shape == (FRAMES, 778, 3)
     np.testing.assert_array_equal(vertex, motion.vertices(model))
     np.testing.assert_array_equal(run.array(f"{base}/control.npy"), vertex)
-    assert run.array(f"{base}/hand_right_face.npy").shape == (1538, 3)
+    face = run.array(f"{base}/hand_right_face.npy")
+    assert face.shape == (1538, 3)
+    np.testing.assert_array_equal(run.tensors(f"{base}/model.safetensors")["hand_face"], face)
     assert np.isfinite(run.array(f"{base}/rollout.npy")).all()
     # What the hand holds was decided before it was refined.
     first = HandMotion.from_tensors(run.tensors(f"{base}/hand_right_initial.safetensors"))
