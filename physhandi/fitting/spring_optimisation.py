@@ -186,18 +186,32 @@ def motion_sway(problems: Many[ObjectProblem], result: FirstOrderResult, device:
     return float(max(sways))
 
 
+def unsteadiness(nudge: float, sway: float, limit: float) -> str:
+    """Say how far a motion goes elsewhere with a little more or less stiffness.
+
+    Args:
+        nudge: Part of the stiffness by which that was tried.
+        sway: `FirstOrderResult.sway`.
+        limit: The most that would be steady.
+
+    Returns:
+        A sentence.
+    """
+    shift = f"moves nodes by {sway:.0%} of their distance ({limit:.0%} would be steady)"
+    if math.isinf(sway):
+        shift = "lets it diverge"
+    return f"The fitted motion is unsteady: {nudge:.0%} more or less stiffness {shift}."
+
+
 class _LaterStart(RelayedProgress):
     """Hears of a descent that begins after others, whose iterations count before its own."""
 
     def __init__(self, progress: Progress, number: int, sway: float) -> None:
         super().__init__(progress)
         self._number = number
-        shift = f"moves it by {sway:.2g} node distances"
-        if math.isinf(sway):
-            shift = "lets it diverge"
         self._note = (
-            f"The fitted motion is unsteady: {NUDGE:.0%} of stiffness {shift}. Springs are fitted "
-            "from another candidate of the search."
+            f"{unsteadiness(NUDGE, sway, STEADY)} Springs are fitted from another candidate of the "
+            "search."
         )
 
     def report(

@@ -5,6 +5,7 @@ predicted frames compare with what the recording shows there, so these warnings 
 nothing that is fitted may depend on them.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from physhandi.fitting import artefacts
 from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, shows_palm, skipped_object
 from physhandi.fitting.config import INTERVALS, SearchVariable
 from physhandi.fitting.search_bounds import bounds_met, interval_text
+from physhandi.fitting.spring_optimisation import unsteadiness
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import PARAMETERS
 
@@ -165,17 +167,14 @@ def _unsteady(out: Path) -> Iterator[FitWarning]:
     with reading(path):
         steadiness = named_fields(read_yaml(path)) or {}
         nudge, sway, limit = (steadiness[name] for name in ("nudge", "sway", "limit"))
-        is_steady = sway is not None and sway <= limit
+        sway = math.inf if sway is None else sway
+        is_steady = sway <= limit
     if not is_steady:
-        shift = "lets it diverge"
-        if sway is not None:
-            shift = f"moves nodes by {sway:.0%} of their distance ({limit:.0%} would be steady)"
         yield FitWarning(
             code="unsteady",
-            message=f"The fitted motion is unsteady: {nudge:.0%} more or less stiffness {shift}. "
-            "The object is about to buckle, and rounding decides which way it goes, so its "
-            "prediction is partly luck. Try another seed of the search (object_.search.seed), a "
-            "longer connection_radius, or more frames.",
+            message=f"{unsteadiness(nudge, sway, limit)} The object is about to buckle, and "
+            "rounding decides which way it goes, so its prediction is partly luck. Try another "
+            "seed of the search (object_.search.seed), a longer connection_radius, or more frames.",
         )
 
 

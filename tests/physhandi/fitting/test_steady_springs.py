@@ -132,7 +132,12 @@ def test_a_later_candidate_that_fails_is_passed_over() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sway", "said"), [(None, "moves it by 0."), (math.inf, "lets it diverge")]
+    ("sway", "said"),
+    [
+        (None, "moves nodes by"),
+        (0.123, "moves nodes by 12% of their distance (5% "),
+        (math.inf, "lets it diverge"),
+    ],
 )
 def test_iterations_of_a_later_start_count_on_and_say_why(
     sway: float | None, said: str, monkeypatch: pytest.MonkeyPatch
@@ -156,7 +161,7 @@ def test_iterations_of_a_later_start_count_on_and_say_why(
 
     fitted(STIFF, SOFT, progress=Heard(), iterations=2)
     assert [report[:2] for report in reports] == [(1, 2), (2, 2), (3, 4), (4, 4)]
-    assert f"unsteady: 1% of stiffness {said}" in reports[2][2]
+    assert f"unsteady: 1% more or less stiffness {said}" in reports[2][2]
     assert [report[2] for report in reports[:2]] == ["", ""]
 
 
