@@ -1,6 +1,5 @@
 """Galleries: folders of plain pages that show runs wherever files can be opened."""
 
-import re
 import shutil
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from app.jobs.views import RunSummary, summarize_run
 from app.pages.render import fill
 from app.previews.clip import clip_of_run
 from physhandi.data.files import temporary_name, write_bytes, write_json
+from physhandi.data.sequence_meta import safe_name
 from physhandi.errors import UsageError
 from physhandi.run import Run
 
@@ -128,17 +128,13 @@ def _file_names(runs: Sequence[Run]) -> list[str]:
     """Name the files of each run after its id; runs of several data folders may share one."""
     names: list[str] = []
     for run in runs:
-        base = _plain_name(run.id)
+        base = safe_name(run.id)
         count, name = 1, base
         while name in names:
             count += 1
             name = f"{base}_{count}"
         names.append(name)
     return names
-
-
-def _plain_name(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]", "_", text)[:80]
 
 
 def _write_run(

@@ -19,7 +19,7 @@ FILE = "sequence.yaml"
 LONGEST_NAME = 64
 """Letters of the longest name of a sequence or a view."""
 SAFE_NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{LONGEST_NAME}}}")
-_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
+_UNSAFE = re.compile("[^A-Za-z0-9_-]+")
 _SIZE_LIMIT = 4_000_000
 _MOST_FRAMES = 1_000_000
 
@@ -119,9 +119,15 @@ class SequenceMeta:
         }
 
 
-def safe_name(name: str, longest: int = LONGEST_NAME) -> str:
-    """Give a name that a folder may have: other letters become _, and the first ones count."""
-    return _UNSAFE.sub("_", name)[:longest]
+def safe_name(name: str, longest: int | None = LONGEST_NAME, *, joins_unsafe: bool = False) -> str:
+    """Give a name that a file or folder may have: letters that it may not have become _.
+
+    Args:
+        name: Any text.
+        longest: How many letters count, the first ones; None for all.
+        joins_unsafe: Whether such letters one after the other become one _, instead of one each.
+    """
+    return _UNSAFE.sub(lambda unsafe: "_" * (1 if joins_unsafe else len(unsafe[0])), name)[:longest]
 
 
 def default_reconstruction_count(frame_count: int) -> int:

@@ -1,6 +1,5 @@
 """Folders of the server's machine from which recordings may be imported in the browser."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +7,7 @@ from app.jobs.catalog import NotFoundError
 from app.settings import ServerSettings
 from physhandi.data.importers.bag import BAG_SUFFIXES
 from physhandi.data.importers.recorded_stream import natural_key
+from physhandi.data.sequence_meta import safe_name
 from physhandi.errors import UsageError
 
 _MOST_LISTED = 500
@@ -41,7 +41,7 @@ class CaptureFolders:
         self.own = settings.capture_dir
         self._roots: dict[str, Path] = {"captures": self.own}
         for folder in settings.captures:
-            label = re.sub(r"[^A-Za-z0-9_-]", "_", folder.name) or "folder"
+            label = safe_name(folder.name, longest=None) or "folder"
             number = 1
             while label in self._roots:
                 number += 1

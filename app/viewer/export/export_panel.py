@@ -1,6 +1,5 @@
 """Downloads: picture, geometry, rollout, parameters and everything of what is on the screen."""
 
-import re
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +19,7 @@ from app.viewer.export.snapshot import (
     snapshot_yaml,
 )
 from app.viewer.ui.guard import Guard, notify
+from physhandi.data.sequence_meta import safe_name
 from physhandi.errors import UsageError
 
 LARGEST_SIDE = 4_096
@@ -28,6 +28,7 @@ _SMALLEST_SIDE = 16
 _FRAME = ("PNG", "PLY", "ZIP")
 _MOTION = ("GLB", "PLYs", "NPZ")
 _TABLES = ("CSV", "YAML")
+_LONGEST_STEM = 60
 _OF_COMPARISON = ("PNG", "NPZ", "CSV", "ZIP")
 """Files that show both sides of a comparison."""
 _RENDER_SECONDS = 60.0
@@ -98,7 +99,7 @@ class ExportPanel:
     def save(self, kind: str, client: viser.ClientHandle) -> None:
         """Send a file to a client, as the button of that name does."""
         snapshot = self._snapshot()
-        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", snapshot.content.title)[:60] or "physhandi"
+        stem = safe_name(snapshot.content.title, _LONGEST_STEM, joins_unsafe=True) or "physhandi"
         suffix = {"PLYs": "ply.zip"}.get(kind, kind.lower())
         is_of_frame = kind in _FRAME
         if kind in {"PNG", "ZIP"}:

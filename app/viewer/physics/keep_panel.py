@@ -1,7 +1,6 @@
 """Choosing a preset, and keeping what sliders have found as a preset or as a run."""
 
 import html
-import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from app.viewer.physics.presets import Preset, PresetStore, builtin_presets
 from app.viewer.ui.guard import Guard, notify
 from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.data.run_folder import new_run_id
-from physhandi.data.sequence_meta import SAFE_NAME
+from physhandi.data.sequence_meta import LONGEST_NAME, SAFE_NAME, safe_name
 from physhandi.errors import UsageError
 from physhandi.fitting.stored_edits import describe_edits, store_edits
 from physhandi.fitting.stored_take import StoredTake, keeps_springs
@@ -31,8 +30,6 @@ from physhandi.simulation.parameters import SimulationParameters, parameter_chan
 
 _POLL_S = 0.3
 _MOST_LETTERS = 80
-_MOST_OF_FOLDER = 64
-_UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +133,8 @@ class RunSaver:
             OSError: If the run cannot be written.
         """
         name = _checked_name(name)
-        folder = self._sequences / _UNSAFE.sub("_", name).strip("_")[:_MOST_OF_FOLDER]
+        safe = safe_name(name, longest=None, joins_unsafe=True).strip("_")[:LONGEST_NAME]
+        folder = self._sequences / safe
         if not SAFE_NAME.fullmatch(folder.name) or folder == self._sequences:
             raise UsageError("Type a name with letters or digits for the recording.")
         if folder.exists() or (BUNDLED / folder.name).exists():

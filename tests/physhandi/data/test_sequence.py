@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import yaml
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
+from physhandi.data.sequence_meta import SequenceMeta, ViewMeta, safe_name
 from physhandi.data.sequence_writer import SequenceWriter, write_sequence
 from physhandi.errors import SequenceError
 
@@ -79,6 +80,24 @@ def folder(tmp_path: Path) -> Path:
 def edit(folder: Path, **fields: object) -> None:
     path = folder / "sequence.yaml"
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | fields))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "safe"),
+    [
+        ("left (2)/é", {}, "left__2___"),
+        ("left (2)/é", {"joins_unsafe": True}, "left_2_"),
+        ("a" * 65, {}, "a" * 64),
+        ("a" * 65, {"longest": None}, "a" * 65),
+        ("a..b", {"longest": 3, "joins_unsafe": True}, "a_b"),
+        ("Fold-2_b", {}, "Fold-2_b"),
+        ("", {}, ""),
+    ],
+)
+def test_letters_that_no_folder_may_have_are_replaced(
+    name: str, options: dict[str, Any], safe: str
+) -> None:
+    assert safe_name(name, **options) == safe
 
 
 def test_everything_written_comes_back(folder: Path) -> None:
