@@ -13,6 +13,9 @@ def work(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
     progress.report("import", 1, 4, None, "left")
     if "broken" in order.get("source", ""):
         raise ImportFailedError("left/color/00003.png: was cut off.")
+    gate = Path(order.get("source", "")) / "gate"
+    if gate.is_fifo():
+        gate.read_bytes()  # Until somebody writes to it.
     out = Path(order["out"])
     out.mkdir(parents=True)
     (out / "order.json").write_text(json.dumps(order))

@@ -1,6 +1,7 @@
 """Recordings imported in the browser: which folders it sees, what they hold, and the import."""
 
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -85,9 +86,12 @@ def imports(settings: ServerSettings, monkeypatch: pytest.MonkeyPatch) -> Iterat
 
 
 def test_the_order_reaches_the_process(imports: Imports, settings: ServerSettings) -> None:
+    gate = settings.capture_dir / "fold" / "gate"
+    os.mkfifo(gate)  # The import waits there, or it might have ended before the next wish.
     task = imports.start(ORDER)
     with pytest.raises(RunError, match="'new' is being imported"):
         imports.make_example()
+    gate.write_bytes(b"")
     until(lambda: task.state != "running")
     assert (task.state, task.reason, task.result) == ("done", "", {"written": "new"})
     assert imports.job("new") is task
