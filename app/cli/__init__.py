@@ -2,12 +2,19 @@
 
 import logging
 import sys
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, get_args
 
 from physhandi.child import end_without_collecting, loading_modules
 from physhandi.errors import PhysHandiError, UsageError, describe
 
 if TYPE_CHECKING:
+    from tyro.constructors import (
+        ConstructorRegistry,
+        PrimitiveConstructorSpec,
+        PrimitiveTypeInfo,
+        UnsupportedTypeAnnotationError,
+    )
     from tyro.extras import SubcommandApp
 
 
@@ -67,6 +74,39 @@ def build() -> "SubcommandApp":
     return app
 
 
+def as_shown() -> "ConstructorRegistry":
+    """Show options that may be left out as ``PATH`` and ``(default: none)``.
+
+    Tyro's ``{None}|PATH`` tells that None can be typed, too, which it still can.
+    """
+    from tyro.conf import DisallowNone
+    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec
+
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def without_none(
+        kind: "PrimitiveTypeInfo",
+    ) -> "PrimitiveConstructorSpec[Any] | UnsupportedTypeAnnotationError | None":
+        if type(None) not in get_args(kind.type) or DisallowNone in kind.markers:
+            return None
+        inner = replace(kind, markers={*kind.markers, DisallowNone})
+        spec = ConstructorRegistry.get_primitive_spec(inner)
+        if not isinstance(spec, PrimitiveConstructorSpec):
+            return spec
+        return replace(
+            spec,
+            instance_from_str=lambda words: (
+                None if words == ["None"] else spec.instance_from_str(words)
+            ),
+            str_from_instance=lambda value: (
+                ["none"] if value is None else spec.str_from_instance(value)
+            ),
+        )
+
+    return registry
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 failed with one clear line, 2 bad usage."""
     from tyro.conf import OmitArgPrefixes
@@ -74,7 +114,10 @@ def main(argv: list[str] | None = None) -> None:
     end_without_collecting()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
-        code = build().cli(prog="physhandi", args=argv, config=(OmitArgPrefixes,)) or 0
+        code = (
+            build().cli(prog="physhandi", args=argv, config=(OmitArgPrefixes,), registry=as_shown())
+            or 0
+        )
     except UsageError as error:
         print(f"physhandi: {error}", file=sys.stderr)
         code = 2

@@ -170,7 +170,7 @@ def simulate(
         sequence: Other sequences of the same object; none takes the run's first one. Substeps are
             chosen anew where the fitted ones would not be stable.
         edits: JSON file with what is done to single springs and nodes (docs/formats.md), in the
-            place of the run's own edits; None for these.
+            place of the run's own edits; none for these.
     """
     source = find_result(run, data_dir)
     device = pick_device(device)

@@ -1,6 +1,7 @@
 """The command line: what it prints, what it writes and how it exits."""
 
 import json
+import re
 import shutil
 import socket
 from collections.abc import Mapping
@@ -113,6 +114,24 @@ def test_help_names_every_command_and_exits_with_0(terminal: Terminal) -> None:
     assert terminal("simulate", "--help") == 0
     assert "--connection-radius" in terminal.out
     assert "δ: object nodes nearer than this get a spring" in terminal.out
+
+
+def test_help_shows_what_may_be_left_out_by_what_it_takes(terminal: Terminal) -> None:
+    names = [name for name, _ in commands(cli.build())]
+    assert {"simulate", "import capture", "benchmark live"} <= set(names)
+    for name in names:
+        assert terminal(*name.split(), "--help") == 0
+        assert "{None" not in terminal.out, name
+        assert not re.search(r"\(default:[\s│]+None", terminal.out), name
+    assert terminal("simulate", "--help") == 0
+    for shown in ("--out PATH ", "--drag FLOAT ", "--self-collision {True,False}", "INT|{auto}"):
+        assert shown in terminal.out
+    assert re.search(r"\(default:[\s│]+none\)", terminal.out)
+    # None may be typed all the same, and no option takes it for a word.
+    typed = ("--drag", "--substeps-per-frame", "--self-collision", "--edits", "--out", "--data-dir")
+    given = (word for option in typed for word in (option, "None"))
+    assert "'nothing' is neither a run folder" in terminal.refused(1, "simulate", "nothing", *given)
+    assert terminal("simulate", "nothing", "--drag", "much") == 2
 
 
 def test_the_doctor_finds_all_well(terminal: Terminal) -> None:
