@@ -56,14 +56,17 @@ def write_all(session: Session) -> None:
 
 def test_a_scrub_that_met_a_frame_on_its_way_is_told_where_it_stands(sessions: Sessions) -> None:
     with watched(sessions) as (session, client):
-        session._playback.set_speed(1e-4)  # Or the clock could come to the frame that is chosen.
+        playback, slider = session._playback, session._timeline._frame
+        playback.set_speed(1e-4)  # Or the clock could come to the frame that is chosen.
+        # A slider that lags behind may stand at the frame that is chosen, which is no change of it.
+        until(lambda: slider.value == playback.frame)
         hear_all(session._server, client)
-        frame = (client.value("Frame") + FRAMES // 2) % FRAMES
+        frame = (playback.frame + FRAMES // 2) % FRAMES
         client.set("Frame", frame)
         client.until(lambda: client.find("Play"))
         # The browser was moved to the frame of the clock after it had sent its own.
         client.until(lambda: client.value("Frame") == frame)
-        assert session._playback.frame == frame
+        assert playback.frame == frame
 
 
 def test_the_sequence_that_was_chosen_last_is_shown_though_it_was_read_first(
@@ -168,26 +171,29 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         client.until(lambda: colors._range.handle.value != (0.0, 1.0))
         painter = colors._painter
         assert painter is not None
-        assert painter.legend is not None
-        # As viser keeps what a user has typed, before it is told to anybody.
-        colors._range.handle._impl.value = (0.25, 0.75)
-        grown = SimpleNamespace(
-            legend=replace(painter.legend, scale=replace(painter.legend.scale, limits=(0.0, 40.0))),
-            offered=painter.offered,
-            quantity=painter.quantity,
-        )
-        monkeypatch.setattr(colors, "_painter", grown)
-        colors.show(is_playing=False, is_hidden=False)
-        write_all(session)
-        assert colors._range.handle.value == (0.25, 0.75)
-        colors._type()
-        factor = painter.quantity("speed").factor
-        assert colors._layers.color_range == pytest.approx((0.25 / factor, 0.75 / factor))
-        # What was heard follows the sequence again when it is let go.
-        colors._layers.color_range = None
-        colors.show(is_playing=False, is_hidden=False)
-        write_all(session)
-        assert colors._range.handle.value == pytest.approx((0.0, 40.0 * factor))
+        with session._lock:  # A frame that is being drawn would write the ends of before.
+            assert painter.legend is not None
+            # As viser keeps what a user has typed, before it is told to anybody.
+            colors._range.handle._impl.value = (0.25, 0.75)
+            grown = SimpleNamespace(
+                legend=replace(
+                    painter.legend, scale=replace(painter.legend.scale, limits=(0.0, 40.0))
+                ),
+                offered=painter.offered,
+                quantity=painter.quantity,
+            )
+            monkeypatch.setattr(colors, "_painter", grown)
+            colors.show(is_playing=False, is_hidden=False)
+            write_all(session)
+            assert colors._range.handle.value == (0.25, 0.75)
+            colors._type()
+            factor = painter.quantity("speed").factor
+            assert colors._layers.color_range == pytest.approx((0.25 / factor, 0.75 / factor))
+            # What was heard follows the sequence again when it is let go.
+            colors._layers.color_range = None
+            colors.show(is_playing=False, is_hidden=False)
+            write_all(session)
+            assert colors._range.handle.value == pytest.approx((0.0, 40.0 * factor))
 
 
 class SlowRollouts:
