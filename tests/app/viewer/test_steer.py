@@ -21,7 +21,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.fitted_object import FittedObject
 from physhandi.pipeline import run_job
 from physhandi.run import Run
-from physhandi.simulation.steering import POSE
+from physhandi.simulation.steering import POSE, SteeredMotion
 
 AT = 8
 STEER, BACK = "Steer (G)", "Back to playback (G)"
@@ -162,16 +162,24 @@ def record(session: Session, client: ViewerClient) -> Recorded:
     return recorded
 
 
-def test_a_recording_is_trimmed_and_played_whenever_that_is_wanted(scene) -> None:
+def test_a_recording_is_trimmed_and_played_whenever_that_is_wanted(
+    scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session, client = scene
     steer(client)
     recorded = record(session, client)
     last = len(recorded.frames) - 1
+    # A take is short, and may have ended before anybody asks whether it is played.
+    replay, begun = SteeredObject.replay, list[SteeredMotion]()
+    monkeypatch.setattr(
+        SteeredObject, "replay", lambda its, motion: (replay(its, motion), begun.append(motion))
+    )
 
     def plays() -> None:
+        begun.clear()
         client.set("Take", "Play take")
-        wait(client, lambda: session._steer.is_on and session._steer._object.is_replaying)
-        wait(client, lambda: not session._steer._object.is_replaying)
+        wait(client, lambda: begun and not session._steer._object.is_replaying)
+        assert len(begun[0].pose) == last - 2
         # The hand is steered on from where the take has brought it.
         np.testing.assert_array_equal(session._steer._object.newest.pose, recorded.frames[-1].pose)
 
