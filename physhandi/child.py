@@ -188,9 +188,11 @@ class Child:
         return self._process.pid
 
     def send(self, request: object) -> None:
-        """Send a request as a line of JSON; one that has ended does not read it."""
-        with suppress(BrokenPipeError):  # `messages` tells that it has ended, and why.
-            self._requests.write(json.dumps(request) + "\n")
+        """Send a request as a line of JSON; one that has ended, or is closed, does not read it."""
+        line = json.dumps(request) + "\n"
+        # `messages` tells that it has ended, and why; another thread may have closed it by now.
+        with suppress(BrokenPipeError, ValueError):
+            self._requests.write(line)
             self._requests.flush()
 
     def end_requests(self) -> None:

@@ -216,6 +216,7 @@ def test_a_child_that_ended_does_not_read_what_it_is_sent() -> None:
             list(child.messages())
         for _ in range(3):
             child.send("x" * 2**16)
+    child.send("closed as well")
 
 
 def test_errors_made_of_more_than_a_sentence_come_back_as_their_kind() -> None:

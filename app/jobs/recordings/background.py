@@ -37,6 +37,15 @@ class Work:
     """Sentence that says what is being done."""
 
 
+class _Process:
+    """The process of one piece of work."""
+
+    def __init__(self) -> None:
+        self.child: Child | None = None
+        self.was_begun = threading.Event()
+        """Set when it is there, or could not be started."""
+
+
 _NAMES = {
     "annotation": "Finding masks and tracks",
     "import": "An import",
@@ -58,9 +67,8 @@ class BackgroundTasks:
         self._lock = threading.Lock()
         self._tasks: dict[tuple[str, str], BackgroundTask] = {}
         self._work: Work | None = None
-        self._child: Child | None = None
-        self._started = threading.Event()
-        """Whether the process of the latest work was started, or could not be."""
+        self._process = _Process()
+        """That of the latest work."""
         self._listener: threading.Thread | None = None
 
     def start(self, work: Work, module: str, order: dict[str, Any]) -> BackgroundTask:
@@ -81,13 +89,12 @@ class BackgroundTasks:
                 raise RunError(f"{running.doing} Wait until that is done, or cancel it.")
             if self._room is not None:
                 self._room.require(_NAMES[work.kind])
-            self._started.clear()
-            self._child = None
+            process = self._process = _Process()
             task = self._tasks[work.kind, work.name] = BackgroundTask("running")
             self._work = work
             # The process ends with the thread that starts it, and those of requests come and go.
             self._listener = threading.Thread(
-                target=self._attend, args=(module, order, task), name=module, daemon=True
+                target=_attend, args=(module, order, task, process), name=module, daemon=True
             )
             self._listener.start()
         return task
@@ -108,9 +115,10 @@ class BackgroundTasks:
         """Stop a piece of work; does nothing if it is not at work."""
         running = self.running
         if running is not None and (running.kind, running.name) == (kind, name):
-            self._started.wait()
-            if self._child is not None:
-                self._child.send("cancel")
+            process = self._process
+            process.was_begun.wait()
+            if process.child is not None:
+                process.child.send("cancel")
 
     def require_settled(self, sequence_ids: Iterable[str]) -> None:
         """Refuse to read recordings that are about to be replaced.
@@ -127,30 +135,32 @@ class BackgroundTasks:
 
     def shutdown(self) -> None:
         """End what is at work."""
+        process = self._process
         if self.running is not None:
-            self._started.wait()
-        if self._child is not None:
-            self._child.kill()
+            process.was_begun.wait()
+        if process.child is not None:
+            process.child.kill()
         if self._listener is not None:
             self._listener.join(timeout=5)
 
-    def _attend(self, module: str, order: dict[str, Any], task: BackgroundTask) -> None:
-        """Start the process and listen to it until it ends."""
-        try:
-            with Child(module, time_limit_s=_LONGEST_S) as child:
-                child.send(order)
-                self._child = child
-                self._started.set()
-                for message in child.messages():
-                    if "result" in message:
-                        task.result = message["result"]
-                    else:
-                        task.progress = message
-            task.state = "done"
-        except CancelledError:
-            task.state = "cancelled"
-        except (PhysHandiError, OSError) as error:
-            task.reason = describe(error)
-            task.state = "failed"
-        finally:
-            self._started.set()
+
+def _attend(module: str, order: dict[str, Any], task: BackgroundTask, process: _Process) -> None:
+    """Start the process and listen to it until it ends."""
+    try:
+        with Child(module, time_limit_s=_LONGEST_S) as child:
+            child.send(order)
+            process.child = child
+            process.was_begun.set()
+            for message in child.messages():
+                if "result" in message:
+                    task.result = message["result"]
+                else:
+                    task.progress = message
+        task.state = "done"
+    except CancelledError:
+        task.state = "cancelled"
+    except (PhysHandiError, OSError) as error:
+        task.reason = describe(error)
+        task.state = "failed"
+    finally:
+        process.was_begun.set()
