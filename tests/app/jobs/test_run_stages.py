@@ -1,6 +1,8 @@
 """Where a run is on its way, and why it stopped."""
 
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from support.server.run_world import make_run
@@ -79,7 +81,8 @@ def test_the_time_of_a_stage_is_measured_and_an_older_attempts_report_is_forgott
     times = iter([100.0, 107.25, 107.5, 110.0])
     with run.begin_attempt() as attempt:
         monkeypatch.setattr(attempt, "_stage_clock", next(times))
-        monkeypatch.setattr("physhandi.data.attempt.time.monotonic", lambda: next(times))
+        clock = SimpleNamespace(monotonic=lambda: next(times), time=time.time)
+        monkeypatch.setattr("physhandi.data.attempt.time", clock)
         attempt.finish_stage(STAGES[0], {})
         monkeypatch.undo()
         attempt.progress().report(STAGES[3], 1, 2)

@@ -4,6 +4,7 @@ import math
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 from app.viewer.live.wire import DRIVE, PAUSE, RESUME, STEER, STEP, Message, send
 from app.viewer.live.worker import Mailbox, PacedFrames, SimulationWorker
@@ -115,7 +116,7 @@ def test_a_pause_takes_back_the_steps_that_were_asked_for() -> None:
 
 def test_a_paced_simulation_waits_for_its_time_and_makes_up_for_nothing(monkeypatch) -> None:
     now = 100.0
-    monkeypatch.setattr("app.viewer.live.worker.time.monotonic", lambda: now)
+    monkeypatch.setattr("app.viewer.live.worker.time", SimpleNamespace(monotonic=lambda: now))
     paced = PacedFrames(iter(range(50)), period=0.5)
     assert paced.due == -math.inf
     paced.advance()
