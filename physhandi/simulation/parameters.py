@@ -353,7 +353,8 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             label="hands push",
             slider=Slider(
                 group="hands",
-                hint="The surface of the hands pushes object nodes that they do not hold.",
+                hint="The surface of the hands pushes object nodes that they do not hold. Arrows "
+                "show what virtual springs do alone.",
             ),
         ),
     ] = False

@@ -95,7 +95,7 @@ def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
     scene.tab("Physics")
     scene.set("d_max virtual", 15)  # What is changed takes two lines more.
     scene.until(lambda: scene.has("every frame is new"), "all frames")
-    for name in ("Springs", "More", "Ground", "Collisions"):
+    for name in ("Springs", "More", "Ground", "Collisions", "Hands"):
         scene.tab(name)
         assert scene.panel.get_by_role("tab", name=name).evaluate(_HANGS_OVER) <= 0, name
     page.keyboard.press("v")

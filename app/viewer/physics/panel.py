@@ -423,7 +423,8 @@ class PhysicsPanel:
             self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
         with groups.add_tab("Collisions"):
             self._sliders.add(*knobs_of("self-collision", parameters, length_unit=unit))
-            if len(fitted.model.hand_face):
+        if len(fitted.model.hand_face):
+            with groups.add_tab("Hands"):
                 self._sliders.add(*knobs_of("hands", parameters, length_unit=unit))
         return substeps
 

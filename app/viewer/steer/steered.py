@@ -32,6 +32,8 @@ MOST_UNDONE = 50
 """Gestures that can be taken back."""
 LONGEST_MOTION = 60.0
 """A motion is no longer than this [s]."""
+_ON_THE_HAND = 1e-5
+"""Least way by which a control node is beside the hand [m]."""
 _MOST_BYTES = 256 << 20
 """States of the object that a motion may keep, whatever their number."""
 
@@ -77,6 +79,10 @@ def begin_motion(
     if not moving:
         raise UsageError("Nothing holds this object, so there is no hand to steer.")
     recorded = np.asarray(rollout.control[frame], np.float64)
+    # What a restart moved off the hand would be a spike of its surface; there it holds anyway.
+    is_moved = np.abs(control - recorded).max(axis=1) > _ON_THE_HAND
+    corner_moved = is_moved[model.hand_face].any(axis=1)
+    model = replace(model, hand_face=model.hand_face[~corner_moved])
     if hands:
         surfaces = [curled(hand.shapes, 0.0) for hand in hands.values()]
         owner = nearest_surface(recorded[:moving], surfaces)
