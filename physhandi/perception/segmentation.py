@@ -123,8 +123,9 @@ _WAY = np.arange(-11.0, 11.01, 0.25)
 """Ways across it at which its color is looked at [px]."""
 _COLOR_ALONG, _EDGE_ALONG = 1.5, 5.0
 """Radii in which colors, and their changes, are averaged along it [px]."""
-_TOO_WIDE, _RIM_ERROR = 0.3, 0.5
-"""How much too far out its rims are before, and by how much that varies [px]."""
+_TOO_WIDE, _TOO_NARROW, _RIM_ERROR = 0.3, 0.1, 0.5
+"""How much too far out its rims are before, or too far in where its colors are learned off its rim,
+and by how much that varies [px]."""
 _LEAST_CHANGE = 2.0
 """Change of color from which it is seen to have a rim there [levels of CIELAB a pixel]."""
 _LEAST_PIECE = 8
@@ -1245,7 +1246,7 @@ def _begin(
         for value, hand in hands.items():
             seen.things[value].replace(patch.code[hand.core & (label == value)])
         _learn_background(seen, patch, shadowed, label)
-    return _outlined(patch, label)
+    return _outlined(seen, patch, label)
 
 
 def _learn_given(seen: _Seen, image: _Image, label: UInt8[ndarray, "row column"]) -> None:
@@ -1287,11 +1288,16 @@ def _off_rim(
     seen: _Seen, patch: _Patch, mask: Bool[ndarray, "row column"]
 ) -> Bool[ndarray, "row column"]:
     """Leave out the rim of the object, unless that is most of it or shows much of its surface."""
-    depth = patch.depth[mask & patch.has_depth]
-    if not depth.size or float(np.median(depth)) > _WIDEST_PIXEL * seen.focal:
+    if not _has_narrow_rim(seen, patch, mask):
         return mask
     inner = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return inner if inner.sum() > _LEAST_INNER * mask.sum() else mask
+
+
+def _has_narrow_rim(seen: _Seen, patch: _Patch, mask: Bool[ndarray, "row column"]) -> bool:
+    """Tell whether a pixel is so narrow on the object that its rim shows little of it."""
+    depth = patch.depth[mask & patch.has_depth]
+    return depth.size > 0 and float(np.median(depth)) <= _WIDEST_PIXEL * seen.focal
 
 
 def _own_seed(
@@ -1336,7 +1342,7 @@ def _advance(
         inner, unsure = _without_thick_hands(seen, patch, inner)
     _learn(seen, patch, labels, score, inner, unsure=unsure)
     result = np.zeros_like(label)
-    result[window] = _outlined(patch, inner)
+    result[window] = _outlined(seen, patch, inner)
     return result
 
 
@@ -1547,7 +1553,9 @@ def _pieces(
     return result
 
 
-def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarray, "row column"]:
+def _outlined(
+    seen: _Seen, patch: _Patch, label: UInt8[ndarray, "row column"]
+) -> UInt8[ndarray, "row column"]:
     """Decide the object's outermost pixels, by GrabCut where it is thick enough for it.
 
     Its smoothness term would eat what is only a few pixels wide, like a rope.
@@ -1555,7 +1563,8 @@ def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarr
     mask = (label == OBJECT_LABEL).astype(np.uint8)
     width = _width_of_thin(mask)
     if width is not None:
-        return _outlined_along(patch, label, max(_STRIP, _STRIP_WIDTHS * width))
+        too_wide = -_TOO_NARROW if _has_narrow_rim(seen, patch, mask > 0) else _TOO_WIDE
+        return _outlined_along(patch, label, max(_STRIP, _STRIP_WIDTHS * width), too_wide)
     thick = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(3))
     sure = cv2.erode(thick, np.ones((3, 3), np.uint8))
     rim = (cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0) & (sure == 0)
@@ -1575,13 +1584,19 @@ def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarr
 
 
 def _outlined_along(
-    patch: _Patch, label: UInt8[ndarray, "row column"], radius: float
+    patch: _Patch, label: UInt8[ndarray, "row column"], radius: float, too_wide: float
 ) -> UInt8[ndarray, "row column"]:
     """Put the rims of a long thin object where hue and saturation change most, on average along it.
 
     Videos keep color at half of their resolution, so the object's reaches a pixel farther than it
     does, and pixels of which a fifth is the object's count as it. Lightness changes more across a
     lit round thing than at its rims.
+
+    Args:
+        patch: The image.
+        label: Labels.
+        radius: Of the surroundings that tell its direction [px].
+        too_wide: How much too far out its rims are expected to be [px].
     """
     mask = label == OBJECT_LABEL
     normal, off, width = _across(mask, radius)
@@ -1620,7 +1635,7 @@ def _outlined_along(
     color = color.reshape(len(row), len(_WAY), 2)
     change = np.linalg.norm(color[:, 2:] - color[:, :-2], axis=2) / (_WAY[2] - _WAY[0])
     change = along(change, change[:, ::-1], _EDGE_ALONG)
-    edge = np.stack([_edge(change, side, width) for side in (-1, 1)], axis=1)
+    edge = np.stack([_edge(change, side, width, too_wide) for side in (-1, 1)], axis=1)
     is_seen = np.isfinite(edge).astype(float)
     edge = np.nan_to_num(edge)
     share = along(is_seen, is_seen[:, ::-1], _EDGE_ALONG)
@@ -1669,12 +1684,12 @@ def _across(
 
 
 def _edge(
-    change: Float[ndarray, "place way"], side: int, width: Float[ndarray, " place"]
+    change: Float[ndarray, "place way"], side: int, width: Float[ndarray, " place"], too_wide: float
 ) -> Float[ndarray, " place"]:
     """Find where across a strip its color changes most on one side [px]; NaN where hardly."""
     way, half = side * _WAY[1:-1], 0.5 * width[:, None]
     is_asked = (way >= 0.35 * half) & (way <= 1.25 * half)
-    expected = np.exp(-0.5 * ((way - half + _TOO_WIDE) / _RIM_ERROR) ** 2)
+    expected = np.exp(-0.5 * ((way - half + too_wide) / _RIM_ERROR) ** 2)
     best = np.where(is_asked, change * expected, -1.0).argmax(axis=1)
     most = change[np.arange(len(change)), best]
     return np.where(most > _LEAST_CHANGE, _WAY[1:-1][best], np.nan)

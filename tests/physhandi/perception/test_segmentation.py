@@ -235,10 +235,10 @@ def test_a_ropes_rims_are_where_its_color_changes_most(turn):
     label = (cover > 0.1).astype(np.uint8)  # What shows any of its color.
     assert agreement(label[None], true, 1)[0] < 0.8
     patch = SimpleNamespace(lab=lab)
-    found = segmentation._outlined_along(patch, label, 3.0)
+    found = segmentation._outlined_along(patch, label, 3.0, 0.3)
     assert agreement(found[None], true, 1)[0] > 0.89
     label[:, :70] = 2 * (label[:, :70] == 0)  # A hand beside it, which stays.
-    assert (segmentation._outlined_along(patch, label, 3.0)[label == 2] == 2).all()
+    assert (segmentation._outlined_along(patch, label, 3.0, 0.3)[label == 2] == 2).all()
 
 
 @pytest.mark.parametrize("width", [3, 7, 12])
@@ -254,10 +254,24 @@ def test_the_direction_across_a_strip_and_its_width_are_found(width):
     assert np.median(wide[inside]) == pytest.approx(width, rel=0.15)
 
 
+@pytest.mark.parametrize("turn", [0.3, 2.0])
+def test_rims_off_which_colors_are_learned_are_not_looked_for_farther_in(turn):
+    lab, cover = filmed_rope(turn)
+    true = (cover > 0.5).astype(np.uint8)
+    depth = np.ones(true.shape, np.float32)
+    patch = SimpleNamespace(lab=lab, depth=depth, has_depth=depth > 0)
+    # Pixels of 2 mm, whose colors are learned off the rim, and of 4 mm; a label that is right.
+    narrow, wide = (
+        segmentation._outlined(SimpleNamespace(focal=focal), patch, true) for focal in (500, 250)
+    )
+    assert wide.sum() < 0.9 * true.sum() < 0.97 * narrow.sum()
+    assert agreement(narrow[None], true[None], 1)[0] > agreement(wide[None], true[None], 1)[0]
+
+
 def test_a_rope_of_the_tables_color_keeps_its_rims():
     lab, cover = filmed_rope(0.3, is_colored=False)
     label = (cover > 0.1).astype(np.uint8)
-    found = segmentation._outlined_along(SimpleNamespace(lab=lab), label, 3.0)
+    found = segmentation._outlined_along(SimpleNamespace(lab=lab), label, 3.0, 0.3)
     np.testing.assert_array_equal(found, label)
 
 
