@@ -2,8 +2,8 @@
 
 At the start of a frame each node gets the nearest triangle of the hands. It is pushed out of the
 plane of that triangle, which moves with the hand, until the frame ends. What a virtual spring
-holds is not pushed as well. Nothing is written by two threads, so the same input gives the same
-bits.
+holds is not pushed as well. No sum depends on the order of threads, so the same input gives the
+same bits.
 """
 
 import warp as wp
@@ -46,7 +46,7 @@ class Touch:
     edge_2: wp.vec3
     """From the first corner to the third [m]."""
     twice_area: wp.float32
-    """[m²]"""
+    """Twice the area of the triangle [m²]."""
     rate: wp.vec3
     """Velocity of the surface beside the node [m/s]."""
 
