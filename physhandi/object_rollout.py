@@ -115,9 +115,8 @@ class ObjectRollout:
         if restart is None or frame <= restart.frame:
             return self.model.held_in(frame)
         if self._continued is None:
-            own, control = self.position[restart.frame], self.control[restart.frame]
             self._continued = restart.continued(
-                self.model, self.parameters, np.asarray(own), np.asarray(control)
+                self.model, self.parameters, *self._strained(restart)
             )
         return self._continued.held_in(frame)
 
@@ -157,6 +156,11 @@ class ObjectRollout:
             own = np.asarray(self.position[restart.frame])
             self.hand_shift = restart.hand_shift(self.model, own)
         return self.hand_shift
+
+    def _strained(self, restart: Restart) -> tuple[ndarray, ndarray]:
+        """Give object and control nodes in the frames whose strain a restart keeps [m]."""
+        frames = slice(restart.strained_frames.start, restart.strained_frames.stop)
+        return np.asarray(self.position[frames]), np.asarray(self.control[frames])
 
     def restart_arrays(self) -> dict[str, ndarray]:
         """Give what an export needs to tell springs after a restart from those before it.
@@ -240,7 +244,7 @@ class ObjectRollout:
         means = [np.asarray(measure(self.model_in(0), given, *self.state(0)), np.float64)]
         for frame in range(1, self.ready):
             if self.restart is not None and frame == self.restart.frame + 1:
-                simulator.continue_from(self.restart, self.control[frame - 1])
+                simulator.continue_from(self.restart, *self._strained(self.restart))
             model, (_, _, end, moving) = self.model_in(frame), self.state(frame)
             begin = end - (self.control[frame] - self.control[frame - 1])
             mean, before = np.zeros_like(means[0]), begin

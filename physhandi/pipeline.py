@@ -385,7 +385,7 @@ def _object_in(
 
 
 def _store_restart(
-    attempt: Attempt, sequence: Sequence, device: str, config: ObjectFitConfig
+    attempt: Attempt, sequence: Sequence, device: str, config: PipelineConfig
 ) -> None:
     """Estimate the object's state in the last fitted frame, from which prediction starts."""
     fitted = _stored_object(attempt, sequence)
@@ -394,10 +394,11 @@ def _store_restart(
             fitted.model,
             fitted.parameters,
             fitted.fitted.control,
-            _followed(attempt, sequence, fitted.model.object_node, config),
+            _followed(attempt, sequence, fitted.model.object_node, config.object_),
             sequence.reconstruction_frames[-1],
             device=device,
             moves_hands=(attempt.out / SequenceFiles(sequence.name).contacts).is_file(),
+            strain_time=config.prediction.strain_time,
         )
     except MissingInputError as error:
         raise MissingInputError(f"Sequence '{sequence.name}': {error}") from error
@@ -420,7 +421,7 @@ def predict_again(
         RunError: If the run holds no fitted object.
         SimulationDivergedError: If the motion runs away.
     """
-    _store_restart(attempt, sequence, device, ObjectFitConfig())
+    _store_restart(attempt, sequence, device, PipelineConfig())
     fitted = _stored_object(attempt, sequence)
     _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
     measured = _measure(sequence, attempt, progress, device=device)
@@ -805,7 +806,7 @@ def _stage_evaluation(
         if has_object:
             if config.prediction.restarts and sequence.future_frames:
                 try:
-                    _store_restart(attempt, sequence, device, config.object_)
+                    _store_restart(attempt, sequence, device, config)
                 except MissingInputError as error:
                     message = f"Predicted without a restart. {error}"
                     progress.report(EVALUATION, number, len(sequences), message=message)

@@ -29,6 +29,7 @@ FIRM_HOLD = 4
 COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
 _CHOICES = ("moves_hands", "eases_grips")
+_OPTIONAL = (*_CHOICES, "strain_frames")
 
 NodeState = tuple[Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]
 """Positions [m] and velocities [m/s] of the object nodes."""
@@ -79,10 +80,15 @@ class Restart:
     """Whether virtual springs of nodes that lie on the ground start without strain. What they were
     stretched by stands for what the hand slipped over the object by, which does not come back when
     the hand turns, and the ground's friction holds these nodes without them."""
+    strain_frames: int = 1
+    """Frames, that of the restart and those before it, over which the strain that springs keep is
+    averaged; 1 keeps that of the moment."""
 
     def __post_init__(self) -> None:
         if self.frame < 0:
             raise ValueError(f"frame is {self.frame}; expected 0 or later.")
+        if self.strain_frames < 1:
+            raise ValueError(f"strain_frames is {self.strain_frames}; expected 1 or more.")
         for name in ("position", "velocity"):
             value = getattr(self, name)
             if value.ndim != 2 or value.shape[1:] != (3,) or len(value) != len(self.position):
@@ -97,12 +103,17 @@ class Restart:
             has = len(self.position)
             raise ValueError(f"position has {has} nodes, but the object has {count}.")
 
+    @property
+    def strained_frames(self) -> range:
+        """The frames over which strain is averaged, the last one that of the restart."""
+        return range(max(0, self.frame + 1 - self.strain_frames), self.frame + 1)
+
     def continued(
         self,
         model: SpringMassModel,
         parameters: SimulationParameters,
-        position: Float[ndarray, "node 3"],
-        control: Float[ndarray, "control 3"],
+        position: Float[ndarray, "strained node 3"],
+        control: Float[ndarray, "strained control 3"],
     ) -> SpringMassModel:
         """Give the model with which the frames after the restart are simulated.
 
@@ -114,19 +125,20 @@ class Restart:
         Args:
             model: The springs until then; virtual ones are changed as the object's own.
             parameters: For the floors of the rest lengths, and the ground.
-            position: The rollout's own nodes in the frame of the restart [m].
-            control: Control nodes in that frame [m].
+            position: The rollout's own nodes in the `strained_frames` [m].
+            control: Control nodes in them [m].
         """
         rest = model.rest_length.astype(np.float64)
-        before = rest * (1.0 + spring_strains(model, position, control))
-        shift = self.hand_shift(model, position)
-        moved = control if shift is None else control + shift
+        before = rest * (1.0 + self._kept_strain(model, position, control))
+        own = position[-1]
+        shift = self.hand_shift(model, own)
+        moved = control[-1] if shift is None else control[-1] + shift
         after = rest * (1.0 + spring_strains(model, self.position, moved))
         scale = np.divide(after, before, out=np.ones_like(rest), where=before > COINCIDENT)
         floor = np.full_like(rest, parameters.virtual_rest_length_floor)
         floor[: model.object_spring_count] = parameters.rest_length_floor
         shortest = np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
-        rests = _rests_on(model, parameters.ground_height, position)
+        rests = _rests_on(model, parameters.ground_height, own)
         scaled = scale * rest
         if self.eases_grips:
             held = model.spring_nodes[model.object_spring_count :].min(axis=1)
@@ -139,6 +151,20 @@ class Restart:
             height = np.maximum(self.position[:, 2] - parameters.ground_height, 0.0)
             clearance = np.where(rests, height, clearance).astype(np.float32)
         return replace(model, rest_length=scaled, clearance=clearance)
+
+    def _kept_strain(
+        self,
+        model: SpringMassModel,
+        position: Float[ndarray, "strained node 3"],
+        control: Float[ndarray, "strained control 3"],
+    ) -> Float[ndarray, " spring"]:
+        """Average strain over the frames in which a spring acts, if it does in the last one."""
+        acts = np.stack([model.acts_in(frame) for frame in self.strained_frames]).astype(np.float64)
+        acts[:-1] *= acts[-1]
+        acts[-1] = 1.0
+        each = zip(acts, position, control, strict=True)
+        total = sum(share * spring_strains(model, *place) for share, *place in each)
+        return total / acts.sum(axis=0)
 
     def hand_shift(
         self, model: SpringMassModel, position: Float[ndarray, "node 3"]
@@ -170,7 +196,7 @@ class Restart:
         """Return every field as an array, ready for safetensors."""
         frame = np.array([self.frame], dtype=np.int32)
         state = {"frame": frame, "position": self.position, "velocity": self.velocity}
-        return state | {name: np.array([getattr(self, name)], dtype=np.int32) for name in _CHOICES}
+        return state | {name: np.array([getattr(self, name)], dtype=np.int32) for name in _OPTIONAL}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Restart":
@@ -180,23 +206,27 @@ class Restart:
             ValueError: If an array is missing, unknown or inconsistent.
         """
         needed = {"frame", "position", "velocity"}
-        if not needed <= set(tensors) <= needed | set(_CHOICES):
+        if not needed <= set(tensors) <= needed | set(_OPTIONAL):
             raise ValueError(
                 "A restart needs the arrays frame, position and velocity, and may have "
-                f"{' and '.join(_CHOICES)}; got {', '.join(sorted(tensors))}."
+                f"{', '.join(_OPTIONAL[:-1])} and {_OPTIONAL[-1]}; got "
+                f"{', '.join(sorted(tensors))}."
             )
-        frame = np.asarray(tensors["frame"]).reshape(-1)
-        if len(frame) != 1:
-            raise ValueError(f"frame has {len(frame)} values; expected one.")
-        moves, eases = (
-            bool(np.asarray(tensors.get(name, [0])).reshape(-1)[0]) for name in _CHOICES
-        )
+        absent = dict.fromkeys(_CHOICES, 0) | {"strain_frames": 1}
+        single = {
+            name: np.asarray(tensors.get(name, absent.get(name))).reshape(-1)
+            for name in ("frame", *_OPTIONAL)
+        }
+        for name, value in single.items():
+            if len(value) != 1:
+                raise ValueError(f"{name} has {len(value)} values; expected one.")
         return cls(
-            frame=int(frame[0]),
+            frame=int(single["frame"][0]),
             position=np.asarray(tensors["position"], np.float32),
             velocity=np.asarray(tensors["velocity"], np.float32),
-            moves_hands=moves,
-            eases_grips=eases,
+            moves_hands=bool(single["moves_hands"][0]),
+            eases_grips=bool(single["eases_grips"][0]),
+            strain_frames=int(single["strain_frames"][0]),
         )
 
 

@@ -161,13 +161,17 @@ class Simulator:
             self.rod.reset()
 
     def continue_from(
-        self, restart: Restart, control: Float[ndarray, "control 3"]
+        self,
+        restart: Restart,
+        position: Float[ndarray, "strained node 3"],
+        control: Float[ndarray, "strained control 3"],
     ) -> Float32[ndarray, "control 3"] | None:
-        """Replace the state by another one, in which every spring is strained as it is now.
+        """Replace the state by another one, in which every spring is strained as it was until now.
 
         Args:
             restart: The state; its frame is the one that has been reached.
-            control: Where the control nodes are [m].
+            position: Object nodes in its `strained_frames`, the last ones as they are now [m].
+            control: Control nodes in them [m].
 
         Returns:
             What to add to the control nodes from now on [m]; None for nothing.
@@ -176,9 +180,8 @@ class Simulator:
             ValueError: If it is a state of another number of nodes.
         """
         restart.check_nodes(self.model.node_count)
-        own = self.position.numpy()
-        model = restart.continued(self.model, self.parameters, own, control)
-        shift = restart.hand_shift(self.model, own)
+        model = restart.continued(self.model, self.parameters, position, control)
+        shift = restart.hand_shift(self.model, position[-1])
         self.reset(restart.position, restart.velocity)
         self.rest_length.assign(model.rest_length)
         self.clearance.assign(model.clearance)
@@ -246,13 +249,18 @@ class Simulator:
             restart.check_nodes(self.model.node_count)
         self.reset(*(start or ()))
         shift: ndarray | None = None
+        strained = range(0) if restart is None else restart.strained_frames
+        own: list[ndarray] = []
         for frame in range(len(control)):
             if frame > 0:
                 way = control[frame - 1 : frame + 1]
                 self.step_frame(frame, *(way if shift is None else way + shift))
-            yield frame, self.position.numpy().copy(), self.velocity.numpy().copy()
+            position = self.position.numpy().copy()
+            if frame in strained:
+                own.append(position)
+            yield frame, position, self.velocity.numpy().copy()
             if restart is not None and frame == restart.frame:
-                shift = self.continue_from(restart, control[frame])
+                shift = self.continue_from(restart, np.stack(own), control[strained])
 
     def rollout(
         self, control: Float[ndarray, "frame control 3"], restart: Restart | None = None

@@ -119,7 +119,7 @@ def test_prediction_starts_where_the_last_fitted_frame_was_seen(
         restart = object_.fitted.restart
         marker = np.load(recordings / name / "marker.npy")
         assert restart is not None
-        assert restart.frame == last
+        assert (restart.frame, restart.strain_frames) == (last, 1)
         # Every node has a marker, which outweighs those around it by far.
         np.testing.assert_allclose(restart.position, marker[last], atol=2e-5)
         rollout = fitted.array(f"sequences/{name}/rollout.npy")

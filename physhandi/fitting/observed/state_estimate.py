@@ -44,6 +44,7 @@ def observed_state(
     *,
     device: str = "cpu",
     moves_hands: bool = False,
+    strain_time: float = 0.0,
 ) -> Restart:
     """Estimate position and velocity of the nodes in a frame.
 
@@ -64,6 +65,7 @@ def observed_state(
         frame: The frame.
         device: Warp device.
         moves_hands: Whether hands go on where what they hold was seen (`Restart.moves_hands`).
+        strain_time: Time until the frame over which the strain of springs is averaged [s].
 
     Raises:
         MissingInputError: If the frame shows no track whose place on the object is known.
@@ -83,6 +85,7 @@ def observed_state(
         velocity=velocity.astype(np.float32),
         moves_hands=moves_hands,
         eases_grips=True,
+        strain_frames=max(1, round(strain_time * parameters.simulated_frame_rate)),
     )
 
 

@@ -101,6 +101,15 @@ def test_no_node_ends_below_the_ground_and_grips_are_eased_there() -> None:
     np.testing.assert_allclose(found.position[:, 2], held.clearance, rtol=1e-6)
 
 
+def test_strain_is_averaged_over_a_time() -> None:
+    model, parameters = as_model(SCENE)
+    shift = observed(np.full((8, 3), 0.002))
+    rate = parameters.simulated_frame_rate
+    for time, frames in ((0.0, 1), (0.4 / rate, 1), (2.6 / rate, 3), (0.5, round(0.5 * rate))):
+        found = observed_state(model, parameters, SCENE.control, shift, LAST, strain_time=time)
+        assert found.strain_frames == frames
+
+
 def test_without_a_track_there_is_no_state() -> None:
     seen = np.ones((4, 8), bool)
     seen[LAST] = False

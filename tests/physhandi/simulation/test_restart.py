@@ -7,6 +7,7 @@ import pytest
 from reference.scenes import as_model, cube_scene
 from reference.spring_mass import Scene, simulate
 
+from physhandi.simulation.contact_intervals import NEVER
 from physhandi.simulation.forces import spring_strains
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -30,17 +31,21 @@ def another_state(scene: Scene, frame: int = AT) -> Restart:
 
 def continued_oracle(scene: Scene, restart: Restart, frame: int = AT) -> np.ndarray:
     """Simulate the frames after a restart in float64, with rest lengths scaled by their ratio."""
-    own = simulate(scene)[0][frame]
     first, second = scene.springs.T
-    lengths = []
-    for node in (own, restart.position.astype(float)):
-        point = np.vstack([node, scene.control[frame]])
-        lengths.append(np.sqrt(((point[second] - point[first]) ** 2).sum(axis=1)))
+
+    def lengths(node: np.ndarray, at: int) -> np.ndarray:
+        point = np.vstack([node, scene.control[at]])
+        return np.sqrt(((point[second] - point[first]) ** 2).sum(axis=1))
+
+    motion = simulate(scene)[0]
+    own, frames = motion[frame], range(frame + 1 - restart.strain_frames, frame + 1)
+    before = np.mean([lengths(motion[at], at) for at in frames], axis=0)
+    ratio = np.maximum(lengths(restart.position.astype(float), frame) / before, 0.64)
     later = replace(
         scene,
         node=restart.position.astype(float),
         velocity=restart.velocity.astype(float),
-        rest=scene.rest * lengths[1] / lengths[0],
+        rest=scene.rest * ratio,
         control=scene.control[frame:],
         clearance=np.where(own[:, 2] < 0.003, restart.position[:, 2].astype(float), 0.0),
         rest_shape=scene.node,
@@ -58,10 +63,28 @@ def test_frames_after_a_restart_agree_with_the_oracle(device: str, distance: flo
     np.testing.assert_allclose(rollout.position[AT + 1 :], after[1:], atol=1e-6)
     # One frame too early or too late would be seen, and so would rest lengths that are not scaled.
     unscaled = replace(scene, rest=scene.rest * 0.99)
-    for wrong in (before[AT + 1 :], continued_oracle(unscaled, restart)[1:]):
+    averaged = continued_oracle(scene, replace(restart, strain_frames=2))[1:]
+    for wrong in (before[AT + 1 :], continued_oracle(unscaled, restart)[1:], averaged):
         assert np.abs(rollout.position[AT + 1 :] - wrong).max() > 1e-4
     early = continued_oracle(scene, restart, AT - 1)
     assert np.abs(rollout.position[AT + 1] - early[1]).max() > 1e-4
+
+
+def test_strain_that_is_averaged_agrees_with_the_oracle(device: str) -> None:
+    scene = cube_scene()
+    restart = replace(another_state(scene), strain_frames=2)
+    rollout = Simulator(*as_model(scene), device=device).rollout(scene.control, restart)
+    after = continued_oracle(scene, restart)
+    np.testing.assert_allclose(rollout.position[AT + 1 :], after[1:], atol=1e-6)
+    # A frame without one before it: the strain of those that there are.
+    early, late = (replace(restart, strain_frames=n) for n in (AT + 1, 100))
+    assert early.strained_frames == late.strained_frames == range(AT + 1)
+    first, second = (
+        Simulator(*as_model(scene), device=device).rollout(scene.control, each)
+        for each in (early, late)
+    )
+    np.testing.assert_array_equal(first.position, second.position)
+    assert np.abs(first.position[AT + 1 :] - rollout.position[AT + 1 :]).max() > 1e-4
 
 
 def test_every_strain_is_kept() -> None:
@@ -69,7 +92,7 @@ def test_every_strain_is_kept() -> None:
     model, parameters = as_model(scene)
     restart, own = another_state(scene), simulate(scene)[0][AT]
     control = scene.control[AT]
-    later = restart.continued(model, parameters, own, control)
+    later = restart.continued(model, parameters, own[None], control[None])
     expected = spring_strains(model, own, control)
     assert np.abs(expected).max() > 0.05
     np.testing.assert_allclose(
@@ -78,6 +101,29 @@ def test_every_strain_is_kept() -> None:
     assert np.abs(spring_strains(model, restart.position, control) - expected).max() > 0.05
     for name in ("stiffness", "damping", "spring_nodes"):
         assert getattr(later, name) is getattr(model, name)
+
+
+def test_a_spring_is_averaged_over_the_frames_in_which_it_acts() -> None:
+    still = np.zeros((1, 3), np.float32)
+    model = SpringMassModel(
+        object_node=still,
+        initial_velocity=still,
+        spring_nodes=np.array([[0, 1], [0, 2], [0, 3]], np.int32),
+        rest_length=np.ones(3, np.float32),
+        stiffness=np.ones(3, np.float32),
+        damping=np.ones(3, np.float32),
+        object_spring_count=0,
+        control_count=3,
+        # The second one pulls on the ways to frames 3 and 4 only, the third up to frame 3.
+        attached=np.array([[0, NEVER], [2, NEVER], [0, 3]], np.int32),
+    )
+    stretch = np.array([[1.1, 1.1, 1.1], [1.2, 1.2, 1.2], [1.6, 1.6, 1.6], [1.8, 1.8, 1.8]])
+    control = stretch[:, :, None] * np.eye(3)
+    restart = Restart(frame=4, position=still, velocity=still, strain_frames=4)
+    parameters = SimulationParameters(virtual_rest_length_floor=0.0)
+    later = restart.continued(model, parameters, np.zeros((4, 1, 3)), control)
+    mean = [np.mean([1.1, 1.2, 1.6, 1.8]), np.mean([1.6, 1.8]), 1.8]
+    np.testing.assert_allclose(later.rest_length, 1.8 / np.array(mean), rtol=1e-6)
 
 
 def hanging() -> tuple[SpringMassModel, SimulationParameters, np.ndarray]:
@@ -117,6 +163,27 @@ def test_a_spring_under_tension_restarts_without_a_kick(device: str) -> None:
     assert simulator.velocity.numpy()[0] == pytest.approx([0.0, 0.0, 5e-3], rel=1e-3, abs=1e-9)
 
 
+def test_a_weight_that_swings_goes_on_with_what_it_bears_on_average(device: str) -> None:
+    model, parameters, _ = hanging()
+    period = 20
+    # ω = √(k/m): a frame is a twentieth of the time in which it swings, and starts 0.1 m too low.
+    rate = period * np.sqrt(STIFFNESS) / (2.0 * np.pi)
+    parameters = parameters.replace(frame_rate=rate, substeps_per_frame=400)
+    low = model.object_node - np.float32([0.0, 0.0, 0.1])
+    model = replace(model, object_node=low)
+    still = {"position": low, "velocity": np.zeros_like(low)}
+    of_moment, of_mean = (
+        Restart(frame=period, strain_frames=frames, **still) for frames in (1, period)
+    )
+    control = np.zeros((period + 6, 1, 3), np.float32)
+    simulator = Simulator(model, parameters, device)
+    kept, kicked = (simulator.rollout(control, each).position for each in (of_mean, of_moment))
+    assert kept[period // 2, 0, 2] == pytest.approx(-HANGING + 0.1, abs=1e-3)
+    np.testing.assert_allclose(kept[period + 1 :], low[None].repeat(5, axis=0), atol=1e-3)
+    # With the strain of the last frame it is pulled by 5 N too much: it swings up by 0.1 (1 - cos).
+    assert kicked[period + 5, 0, 2] - low[0, 2] == pytest.approx(0.1, abs=2e-3)
+
+
 def test_what_follows_a_restart_is_the_same_bits_and_leaves_nothing_behind(device: str) -> None:
     scene = cube_scene()
     restart = another_state(scene)
@@ -152,11 +219,11 @@ def test_rest_lengths_stay_above_their_bounds_and_coincident_nodes_keep_theirs()
     # The first and the last spring vanish, the second has no length, the third doubles.
     moved = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [4, 0, 0]], np.float32)
     restart = Restart(frame=0, position=moved, velocity=np.zeros_like(moved))
-    later = restart.continued(model, parameters, node, control)
+    later = restart.continued(model, parameters, node[None], control[None])
     # A spring of 64 % of the length is 1.25² times as stiff, which automatic substeps allow for.
     np.testing.assert_allclose(later.rest_length, [0.64, 0.4, 1.0, 0.2], rtol=1e-6)
     bare = parameters.replace(rest_length_floor=0.0, virtual_rest_length_floor=0.0)
-    later = restart.continued(model, bare, node, control)
+    later = restart.continued(model, bare, node[None], control[None])
     np.testing.assert_allclose(later.rest_length, [0.64, 0.4, 1.0, 0.16], rtol=1e-6)
 
 
@@ -176,7 +243,7 @@ def test_what_lies_on_the_ground_lies_where_it_is_seen_and_what_does_not_falls(d
     parameters = SimulationParameters(restitution=0.0, frame_rate=30.0, ground_height=0.0)
     seen = node + np.float32([0.0, 0.0, 0.005])
     restart = Restart(frame=0, position=seen, velocity=np.zeros_like(node))
-    later = restart.continued(model, parameters, node, np.zeros((0, 3)))
+    later = restart.continued(model, parameters, node[None], np.zeros((1, 0, 3)))
     np.testing.assert_allclose(later.clearance, [0.009, 0.0115, 0.004], rtol=1e-6)
     simulator = Simulator(model, parameters, device)
     control = np.zeros((9, 0, 3), np.float32)
@@ -185,7 +252,7 @@ def test_what_lies_on_the_ground_lies_where_it_is_seen_and_what_does_not_falls(d
     assert height[-1, 2] == pytest.approx(0.004, abs=1e-4)
     np.testing.assert_allclose(simulator.rollout(control).position[-1, :, 2], 0.004, atol=1e-4)
     without = restart.continued(
-        model, parameters.replace(ground_height=None), node, np.zeros((0, 3))
+        model, parameters.replace(ground_height=None), node[None], np.zeros((1, 0, 3))
     )
     np.testing.assert_array_equal(without.clearance, model.clearance)
 
@@ -210,5 +277,14 @@ def test_a_restart_that_does_not_fit_is_refused() -> None:
     kept = Restart(frame=3, position=still + 1, velocity=still + 2)
     again = Restart.from_tensors(kept.to_tensors())
     assert (again.frame, again.position[0, 0], again.velocity[0, 0]) == (3, 1.0, 2.0)
+    assert again.strain_frames == 1
+    averaged = replace(kept, strain_frames=15).to_tensors()
+    assert Restart.from_tensors(averaged).strain_frames == 15
+    del averaged["strain_frames"]
+    assert Restart.from_tensors(averaged).strain_frames == 1
+    with pytest.raises(ValueError, match="strain_frames has 2 values; expected one"):
+        Restart.from_tensors({**averaged, "strain_frames": np.ones(2, np.int32)})
+    with pytest.raises(ValueError, match="strain_frames is 0; expected 1 or more"):
+        replace(kept, strain_frames=0)
     with pytest.raises(ValueError, match="got frame, position"):
         Restart.from_tensors({"frame": np.zeros(1, np.int32), "position": still})

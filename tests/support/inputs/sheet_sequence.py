@@ -85,4 +85,6 @@ def sheet_config(*, generations: int, population: int, iterations: int) -> Pipel
     first_order = config.object_.first_order.replace(iterations=iterations)
     simulation = config.simulation.replace(connection_radius=0.08, virtual_connection_radius=0.02)
     object_ = config.object_.replace(search=search, first_order=first_order)
-    return config.replace(object_=object_, simulation=simulation)
+    # It begins to be lifted half a second before: what it bore until then says nothing of now.
+    prediction = config.prediction.replace(strain_time=0.0)
+    return config.replace(object_=object_, simulation=simulation, prediction=prediction)
