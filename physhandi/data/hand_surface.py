@@ -10,9 +10,7 @@ from numpy import ndarray
 from physhandi.data.arrays import read_array
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.run_folder import reading
-
-_SIDES = ("right", "left")
-"""Order of hands among the control nodes of a run."""
+from physhandi.data.sequence_meta import SIDES
 
 
 def joined_faces(
@@ -47,7 +45,7 @@ def stored_faces(out: Path, sequence: str, control_count: int) -> Int32[ndarray,
         RunError: If a file is damaged.
     """
     files, hands = SequenceFiles(sequence), []
-    for side in _SIDES:
+    for side in SIDES:
         vertex, face = (out / file for file in (files.hand_vertex(side), files.hand_face(side)))
         if vertex.is_file() and face.is_file():
             with reading(vertex):

@@ -19,7 +19,7 @@ from physhandi.data.length_unit import (
     doubt_keypoints,
     doubt_position,
 )
-from physhandi.data.sequence_meta import FILE, SequenceMeta, ShapeClass, Side, read_meta
+from physhandi.data.sequence_meta import FILE, SIDES, SequenceMeta, ShapeClass, Side, read_meta
 from physhandi.data.sequence_meta import ViewMeta as ViewMeta
 from physhandi.data.truth import TRUTH_FOLDER as TRUTH
 from physhandi.data.truth import read_held_out_views
@@ -50,13 +50,12 @@ VIEW_ARRAYS: _Table = {
     "track_visible.npy": (("frame", "track"), _B, False),
 }
 
-_SIDES = ("right", "left")
 # Axes that must not be empty: without a node or a control there is nothing to simulate.
 _NEEDED = {"control", "marker", "node"}
 _MOST_BYTES = 2**32
 TRUTH_ARRAYS: _Table = {
-    **{f"hand_{side}_keypoint.npy": (("frame", 21, 3), _F, False) for side in _SIDES},
-    **{f"hand_{side}_vertex.npy": (("frame", f"{side} vertex", 3), _F, False) for side in _SIDES},
+    **{f"hand_{side}_keypoint.npy": (("frame", 21, 3), _F, False) for side in SIDES},
+    **{f"hand_{side}_vertex.npy": (("frame", f"{side} vertex", 3), _F, False) for side in SIDES},
     "contact_point.npy": (("point", 3), _F, False),
     "contact.npy": (("frame", "point"), _B, False),
     "object_point.npy": (("frame", "point", 3), _F, False),

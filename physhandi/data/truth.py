@@ -16,7 +16,7 @@ from numpy import ndarray
 from physhandi.data.arrays import read_array
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import named_fields, parse_yaml
-from physhandi.data.sequence_meta import Side
+from physhandi.data.sequence_meta import SIDES, Side
 from physhandi.data.view import View
 from physhandi.errors import SequenceError
 
@@ -28,7 +28,6 @@ ANNOTATION_FOLDER = f"{TRUTH_FOLDER}/annotation"
 """Folder of a sequence that may hold masks and tracks of each view without any error."""
 HELD_OUT_CAMERA = "camera.yaml"
 """File of such a view that holds its calibration, in the fields that ``sequence.yaml`` has."""
-_SIDES: tuple[Side, Side] = ("right", "left")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,7 +60,7 @@ def read_truth(folder: Path) -> Truth:
         return read_array(path) if path.is_file() else None
 
     def of_hands(part: str) -> dict[Side, Any]:
-        arrays: dict[Side, Any] = {side: read(f"hand_{side}_{part}.npy") for side in _SIDES}
+        arrays: dict[Side, Any] = {side: read(f"hand_{side}_{part}.npy") for side in SIDES}
         return {side: array for side, array in arrays.items() if array is not None}
 
     return Truth(

@@ -23,7 +23,7 @@ from physhandi.data.arrays import write_array
 from physhandi.data.files import named_fields, write_yaml
 from physhandi.data.length_unit import doubt_keypoints
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_meta import FILE
+from physhandi.data.sequence_meta import FILE, SIDES
 from physhandi.data.view import View
 from physhandi.errors import ImportFailedError, UsageError
 from physhandi.hand.mano import ManoHand
@@ -32,7 +32,6 @@ from physhandi.progress import NullProgress, Progress
 
 HANDS_FORMAT = "physhandi-hands/1"
 """Format name in a file of results."""
-_SIDES = ("right", "left")
 _MOST_BYTES = 1 << 30
 """Size of the largest file, unpacked, that is read [byte]."""
 _PALMS = (0.04, 0.2)
@@ -286,7 +285,7 @@ class _Results:
     def _check_texts(self) -> None:
         names = [view.name for view in self._sequence.views]
         for number, side in enumerate(self._text["side"]):
-            if side not in _SIDES:
+            if side not in SIDES:
                 self._fail("side", number, f"is '{side}'; right or left is expected")
             if side not in self._sequence.hands:
                 self._fail(
