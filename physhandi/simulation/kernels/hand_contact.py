@@ -51,6 +51,31 @@ class Touch:
     """Velocity of the surface beside the node [m/s]."""
 
 
+@wp.struct
+class Push:
+    """How hard a hand pushes a node in a substep, with the terms of the law in `push_nodes`."""
+
+    acts: wp.bool
+    """Whether it pushes; if not, the fields below mean nothing."""
+    touch: Touch
+    slip: wp.vec3
+    """The law's u: velocity past the surface after this substep without a push [m/s]."""
+    leaving: wp.float32
+    """The part of it out of the hand, u·n [m/s]."""
+    sliding: wp.vec3
+    """The part of it along the surface, t [m/s]."""
+    speed: wp.float32
+    """Length of that part, at least `SLIDING_SPEED` [m/s]."""
+    load: wp.float32
+    """The law's q [N]."""
+    room: wp.float32
+    """The law's 1 - u·n / s."""
+    yields: wp.float32
+    """The law's 1 + dt q / s."""
+    pressure: wp.float32
+    """The law's N [N]."""
+
+
 @wp.func
 def nearest_weights(point: wp.vec3, edge_1: wp.vec3, edge_2: wp.vec3):
     """Return the barycentric weights of the point of a triangle that is nearest to a point.
@@ -196,9 +221,46 @@ def touch_of(
 
 
 @wp.func
-def slip_of(world: World, touch: Touch, velocity: wp.vec3, force: wp.vec3):
-    """Return how fast a node would move past the surface after this substep without a push."""
-    return velocity + world.dt * (force - wp.vec3(0.0, 0.0, world.gravity)) - touch.rate
+def push_of(
+    node: int,
+    fraction: float,
+    frame_rate: float,
+    world: World,
+    hand_face: wp.array[wp.vec3i],
+    shift: wp.array[wp.vec3],
+    face: wp.array[int],
+    weight: wp.array[wp.vec3],
+    position: wp.vec3,
+    velocity: wp.vec3,
+    force: wp.vec3,
+    control_start: wp.array[wp.vec3],
+    control_end: wp.array[wp.vec3],
+):
+    """Return how hard a hand pushes a node on which springs act with a `force`."""
+    push = Push()
+    if face[node] >= 0:
+        push.touch = touch_of(
+            hand_face[face[node]],
+            weight[node],
+            fraction,
+            frame_rate,
+            position,
+            shift,
+            control_start,
+            control_end,
+        )
+        normal = push.touch.normal
+        kick = world.dt * (force - wp.vec3(0.0, 0.0, world.gravity))
+        push.slip = velocity + kick - push.touch.rate
+        push.leaving = wp.dot(normal, push.slip)
+        push.acts = push.touch.depth > 0.0 and push.leaving < LEAVING_SPEED
+        push.load = world.push_stiffness * push.touch.depth
+        push.room = 1.0 - push.leaving / LEAVING_SPEED
+        push.yields = 1.0 + world.dt * push.load / LEAVING_SPEED
+        push.pressure = push.load * push.room / push.yields
+        push.sliding = push.slip - push.leaving * normal
+        push.speed = wp.max(wp.length(push.sliding), SLIDING_SPEED)
+    return push
 
 
 @wp.kernel
@@ -233,27 +295,24 @@ def push_nodes(
     """
     node = wp.tid()
     force = spring_sum(node, entry_start, entry, pull)
-    if face[node] >= 0:
-        touch = touch_of(
-            hand_face[face[node]],
-            weight[node],
-            fraction,
-            frame_rate,
-            position[node],
-            shift,
-            control_start,
-            control_end,
-        )
-        slip = slip_of(world[0], touch, velocity[node], force)
-        leaving = wp.dot(touch.normal, slip)
-        if touch.depth > 0.0 and leaving < LEAVING_SPEED:
-            load = world[0].push_stiffness * touch.depth
-            room = 1.0 - leaving / LEAVING_SPEED
-            pressure = load * room / (1.0 + world[0].dt * load / LEAVING_SPEED)
-            sliding = slip - leaving * touch.normal
-            speed = wp.max(wp.length(sliding), SLIDING_SPEED)
-            grip = wp.min(world[0].hand_friction * pressure, speed / world[0].dt)
-            force += pressure * touch.normal - (grip / speed) * sliding
+    push = push_of(
+        node,
+        fraction,
+        frame_rate,
+        world[0],
+        hand_face,
+        shift,
+        face,
+        weight,
+        position[node],
+        velocity[node],
+        force,
+        control_start,
+        control_end,
+    )
+    if push.acts:
+        grip = wp.min(world[0].hand_friction * push.pressure, push.speed / world[0].dt)
+        force += push.pressure * push.touch.normal - (grip / push.speed) * push.sliding
     force_out[node] = force
 
 
@@ -292,31 +351,28 @@ def push_adjoint(
     for corner in range(3):
         corner_bar_out[node, corner] = wp.vec3(0.0, 0.0, 0.0)
         corner_rate_bar_out[node, corner] = wp.vec3(0.0, 0.0, 0.0)
-    if face[node] < 0:
-        return
-    touch = touch_of(
-        hand_face[face[node]],
-        weight[node],
+    force = spring_sum(node, entry_start, entry, pull)
+    push = push_of(
+        node,
         fraction,
         frame_rate,
-        position[node],
+        world[0],
+        hand_face,
         shift,
+        face,
+        weight,
+        position[node],
+        velocity[node],
+        force,
         control_start,
         control_end,
     )
-    force = spring_sum(node, entry_start, entry, pull)
-    slip = slip_of(world[0], touch, velocity[node], force)
-    normal = touch.normal
-    leaving = wp.dot(normal, slip)
-    if touch.depth <= 0.0 or leaving >= LEAVING_SPEED:
+    if not push.acts:
         return
+    touch, slip, leaving = push.touch, push.slip, push.leaving
+    normal, sliding, speed = touch.normal, push.sliding, push.speed
+    load, room, yields, pressure = push.load, push.room, push.yields, push.pressure
     friction, dt = world[0].hand_friction, world[0].dt
-    load = world[0].push_stiffness * touch.depth
-    room = 1.0 - leaving / LEAVING_SPEED
-    yields = 1.0 + dt * load / LEAVING_SPEED
-    pressure = load * room / yields
-    sliding = slip - leaving * normal
-    speed = wp.max(wp.length(sliding), SLIDING_SPEED)
     force_bar = force_bar_out[node]
 
     pressure_bar = wp.dot(normal, force_bar)
