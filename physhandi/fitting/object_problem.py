@@ -7,7 +7,7 @@ compares them with what was observed (physics.md §4.1).
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -46,6 +46,8 @@ class ObjectProblem:
     """The object's rest shape, which gives topology and rest lengths [m]."""
     control: Float[ndarray, "all_frame control 3"]
     """Positions of the control nodes, also in frames that are not fitted [m]."""
+    hand_face: Int32[ndarray, "face 3"]
+    """Triangles of the hands' surface, their corners control nodes; see `SpringMassModel`."""
     frame_rate: float
     """Frames a second [Hz]."""
     ground_height: float | None
@@ -72,8 +74,6 @@ class ObjectProblem:
     """Position of a track less the weighted mean of its carriers, at frame 0 [m]."""
     surface_count: int | None = None
     """Leading nodes that lie on the surface, which alone enter the Chamfer term; None for all."""
-    hand_face: Int32[ndarray, "face 3"] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
-    """Triangles of the hands' surface, their corners control nodes; see `SpringMassModel`."""
     contacts: ContactIntervals | None = None
     """Contacts of the hands over time; None for contact with all that is near them at frame 0."""
 
@@ -143,6 +143,7 @@ def build_problem(
     object_node: Float[ndarray, "node 3"],
     rest_node: Float[ndarray, "node 3"],
     control: Float[ndarray, "frame control 3"],
+    hand_face: Int32[ndarray, "face 3"],
     frame_count: int,
     frame_rate: float,
     ground_height: float | None,
@@ -153,7 +154,6 @@ def build_problem(
     cloud_points: int | None = 300,
     starts_at_rest: bool = False,
     contacts: ContactIntervals | None = None,
-    hand_face: Int32[ndarray, "face 3"] | None = None,
 ) -> ObjectProblem:
     """Reduce a sequence to the tensors that the object fit reads.
 
@@ -163,6 +163,8 @@ def build_problem(
         object_node: Object nodes at frame 0 [m].
         rest_node: The same nodes in the rest shape [m].
         control: Control node positions over all frames [m].
+        hand_face: Triangles of the hands' surface, their corners control nodes; none if control
+            nodes are no surface.
         frame_count: Frames to fit, counted from 0; later ones are never read.
         frame_rate: Frames a second [Hz].
         ground_height: Height of the ground; None without ground [m].
@@ -174,7 +176,6 @@ def build_problem(
         cloud_points: Most points of a frame that enter the Chamfer term; None for all.
         starts_at_rest: Whether the object rests at frame 0, whatever the tracks say.
         contacts: What the hands touch, and when; None for what is near them at frame 0, always.
-        hand_face: Triangles of the hands' surface, their corners control nodes; none if left out.
 
     Returns:
         The problem, on the CPU.
@@ -215,6 +216,7 @@ def build_problem(
         object_node=np.asarray(object_node, np.float32),
         rest_node=np.asarray(rest_node, np.float32),
         control=np.asarray(control, np.float32),
+        hand_face=hand_face,
         frame_rate=frame_rate,
         ground_height=ground_height,
         gravity=gravity,
@@ -231,7 +233,6 @@ def build_problem(
         track_offset=torch.from_numpy(offset),
         surface_count=surface_count,
         contacts=contacts,
-        **({} if hand_face is None else {"hand_face": hand_face}),
     )
 
 

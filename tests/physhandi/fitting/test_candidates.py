@@ -66,6 +66,7 @@ def sheet(name: str, lift: float, gravity: float = 9.81, **more: object) -> Obje
         "object_node": NODE,
         "rest_node": NODE,
         "control": (corner[None] + rise).astype(np.float32),
+        "hand_face": np.zeros((0, 3), np.int32),
         "frame_count": FRAMES,
         "frame_rate": 30.0,
         "ground_height": None,

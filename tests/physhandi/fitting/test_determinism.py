@@ -54,6 +54,7 @@ def problem(run: Run) -> ObjectProblem:
         object_node=np.load(folder / "object_node.npy"),
         rest_node=np.load(run.out / "object/rest_node.npy"),
         control=artefacts.load_control(run.out, NAME),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=FRAMES,
         frame_rate=30.0,
         ground_height=0.0,

@@ -80,6 +80,7 @@ def refine(run: Run, motion: HandMotion, config: RefinementConfig = FREE) -> Ref
         object_node=np.load(folder / "object_node.npy"),
         rest_node=np.load(run.out / "object/rest_node.npy"),
         control=np.load(folder / "control.npy"),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=FITTED.stop,
         frame_rate=FRAME_RATE,
         ground_height=0.0,

@@ -109,6 +109,7 @@ def test_a_gpu_computes_the_same_losses_and_the_same_bits_every_time() -> None:
         object_node=np.zeros((nodes, 3), np.float32),
         rest_node=np.zeros((nodes, 3), np.float32),
         control=np.zeros((4, 0, 3), np.float32),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_rate=30.0,
         ground_height=None,
         gravity=0.0,

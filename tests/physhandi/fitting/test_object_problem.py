@@ -26,6 +26,7 @@ def problem(observation: ObjectObservation, **more: object) -> ObjectProblem:
         "object_node": NODE,
         "rest_node": NODE,
         "control": np.zeros((4, 1, 3), np.float32),
+        "hand_face": np.zeros((0, 3), np.int32),
         "frame_count": 3,
         "frame_rate": 30.0,
         "ground_height": 0.0,

@@ -66,6 +66,7 @@ def held_sheet(name: str, lift: float, scale: float = 1.0) -> ObjectProblem:
         object_node=NODE,
         rest_node=NODE,
         control=control,
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=FRAMES,
         frame_rate=30.0,
         ground_height=None,

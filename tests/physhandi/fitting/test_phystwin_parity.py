@@ -45,6 +45,7 @@ def problem_of(case: Case, config: PipelineConfig) -> ObjectProblem:
         object_node=case["position_0"] * UP,
         rest_node=case["position_0"] * UP,
         control=case["control"] * UP,
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=len(case["position"]),
         frame_rate=30.0,
         ground_height=0.0,

@@ -66,6 +66,7 @@ def lifted_sheet() -> ObjectProblem:
         object_node=node,
         rest_node=node,
         control=(node[[0, 3]] + [0.0, 0.0, 0.01] + 0.03 * rise).astype(np.float32),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=FRAMES,
         frame_rate=30.0,
         ground_height=None,

@@ -85,6 +85,7 @@ def problem_of(config: PipelineConfig) -> ObjectProblem:
         object_node=node,
         rest_node=node,
         control=control,
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=FRAMES,
         frame_rate=30.0,
         ground_height=0.0,

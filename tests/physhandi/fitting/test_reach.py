@@ -29,6 +29,7 @@ def problem(node: np.ndarray = NODE) -> ObjectProblem:
         object_node=node,
         rest_node=node,
         control=np.stack([CONTROL, CONTROL]),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=2,
         frame_rate=30.0,
         ground_height=None,

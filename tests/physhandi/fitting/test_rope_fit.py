@@ -67,6 +67,7 @@ def problem_of(marker: np.ndarray, rate: float) -> ObjectProblem:
         object_node=marker[0],
         rest_node=rest,
         control=np.concatenate([marker[:, HELD], held[:, None]], axis=1),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=len(marker),
         frame_rate=rate,
         ground_height=None,

@@ -49,6 +49,7 @@ def held(node: np.ndarray, control: np.ndarray, gravity: float = 9.81) -> Object
         object_node=node,
         rest_node=node,
         control=np.repeat(control[None].astype(np.float32), 3, axis=0),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=3,
         frame_rate=30.0,
         ground_height=None,

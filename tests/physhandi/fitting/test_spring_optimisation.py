@@ -59,6 +59,7 @@ def sliding_pair(friction: float, *, speed: float = 2.0) -> ObjectProblem:
         object_node=node,
         rest_node=node,
         control=np.zeros((FRAMES, 0, 3), np.float32),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=FRAMES,
         frame_rate=30.0,
         ground_height=0.0,

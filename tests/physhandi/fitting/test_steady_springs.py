@@ -54,6 +54,7 @@ def stretched_pair() -> ObjectProblem:
         object_node=node,
         rest_node=node * (REST / LENGTH),
         control=np.zeros((FRAMES, 0, 3), np.float32),
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=FRAMES,
         frame_rate=30.0,
         ground_height=None,

@@ -134,6 +134,7 @@ def held_patch(
         object_node=node,
         rest_node=node,
         control=other if chosen is None else other[:, chosen],
+        hand_face=np.zeros((0, 3), np.int32),
         frame_count=fitted,
         frame_rate=parameters.frame_rate,
         ground_height=parameters.ground_height,
