@@ -32,7 +32,10 @@ _STEP = 0.5
 _INSET = 1.0
 """Distance from an end up to which a line is straight, in cells: few points are there."""
 _OUTER = 2
-"""Points that may lie beyond an end, as noise moves some out."""
+"""Points that may lie beyond an end at least, as noise moves some out."""
+_BEYOND, _INNER = 0.5, 4.0
+"""Length on which there are as many points as may lie beyond an end, and that on which they are
+counted, in cells."""
 _STRAY = 2.0
 """Distance from the line from which points count less, in medians of that distance."""
 _OFF = 2.5
@@ -100,7 +103,7 @@ def _line(cloud: Float[ndarray, "point 3"], graph: csr_array, cell: float) -> Ce
     weight = np.ones(len(place))
     off, corner, arc = np.zeros(0), np.zeros((0, 3)), np.zeros(0)
     for _ in range(_ROUNDS):
-        start, end = _ends(along, weight)
+        start, end = _ends(along, weight, cell)
         if end - start < _SHORTEST * cell:
             return None
         inset = min(_INSET * cell, 0.25 * (end - start))
@@ -111,7 +114,7 @@ def _line(cloud: Float[ndarray, "point 3"], graph: csr_array, cell: float) -> Ce
         place = cloud
         along, off = _nearest(corner, arc, place)
         weight = 1.0 / np.maximum(1.0, off / (_STRAY * float(np.median(off)))) ** 2
-    start, end = _ends(along, weight)
+    start, end = _ends(along, weight, cell)
     is_off = off > max(_OFF * float(np.median(off)), cell)
     width = 2.0 * float(np.percentile(off, 90))
     if is_off.mean() > _MOST_OFF or end - start < max(_LONG * width, _SHORTEST * cell):
@@ -134,11 +137,27 @@ def _longest_path(
     return cloud[path[::-1]], away[path[::-1]]
 
 
-def _ends(along: Float[ndarray, " point"], weight: Float[ndarray, " point"]) -> tuple[float, float]:
-    """Tell between which lengths the points of a line are."""
-    ordered = np.sort(along[weight > 0.25])
+def _ends(
+    along: Float[ndarray, " point"], weight: Float[ndarray, " point"], cell: float
+) -> tuple[float, float]:
+    """Tell between which lengths the points of a line are.
+
+    A mask that is a pixel too long adds a few points of the background at once, centimetres behind
+    the end but beside it for the camera. So an end is not where the last points are but where these
+    few would end if they lay as densely as those before them.
+    """
+    points = along[weight > 0.25]
+    return _first(np.sort(points), cell), -_first(np.sort(-points), cell)
+
+
+def _first(ordered: Float[ndarray, " point"], cell: float) -> float:
+    """Find where sorted lengths begin."""
     outer = min(_OUTER, (len(ordered) - 1) // 2)
-    return float(ordered[outer]), float(ordered[-1 - outer])
+    inner = ordered[outer] + np.array([_BEYOND, _BEYOND + _INNER]) * cell
+    low, high = np.searchsorted(ordered, inner)
+    density = max(high - low, 1) / (_INNER * cell)
+    beyond = int(np.clip(round(_BEYOND * cell * density), outer, max(outer, len(ordered) // 4)))
+    return float(ordered[beyond] - beyond / density)
 
 
 def _regression(

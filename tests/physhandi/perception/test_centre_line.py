@@ -24,6 +24,23 @@ def test_a_centre_line_is_as_long_as_the_thing_whatever_the_noise():
         np.testing.assert_allclose(line.arc_of(place), np.linspace(0, line.length, 50), atol=1e-6)
 
 
+def test_a_few_points_behind_an_end_move_it_by_their_share():
+    random = np.random.default_rng(2)
+    along = np.linspace(0.0, 0.4, 1600)
+    across = random.normal(size=(1600, 2))
+    across *= 0.004 / np.linalg.norm(across, axis=1, keepdims=True)
+    rod = np.column_stack([along, across])
+    # A row of pixels of the table behind the end: eight points, 2 mm of the rod has as many.
+    behind = np.column_stack([np.full(8, 0.408), np.linspace(-0.003, 0.003, 8), np.full(8, -0.004)])
+    lengths = []
+    for cloud in (rod, np.concatenate([rod, behind]), rod[along < 0.39]):
+        (line,) = centre_lines(cloud, 0.008)
+        lengths.append(line.length)
+    assert lengths[0] == pytest.approx(0.4, abs=1e-3)
+    assert lengths[0] + 1e-3 < lengths[1] < lengths[0] + 3e-3
+    assert lengths[0] - lengths[2] == pytest.approx(0.01, abs=1e-3)
+
+
 def star(arms: int) -> np.ndarray:
     away = np.linspace(0.0, 0.1, 200)[:, None]
     turns = 2 * np.pi * np.arange(arms) / arms
