@@ -251,7 +251,7 @@ class ObjectRollout:
             for stop in range(count + 1):
                 place = begin + np.float32(stop / count) * (end - begin)
                 if stop > 0:
-                    simulator.step_frame(frame, before, place)
+                    simulator.step_frame(frame, before, place, goes_on=stop > 1)
                 state = simulator.position.numpy(), simulator.velocity.numpy(), place, moving
                 weight = (0.5 if stop in {0, count} else 1.0) / count
                 mean = mean + weight * np.asarray(measure(model, given, *state), np.float64)

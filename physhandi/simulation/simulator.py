@@ -79,6 +79,7 @@ class Simulator:
         self.first_divergence = self.array(np.array([NO_DIVERGENCE]), wp.int32)
         self._held: ndarray | None = None
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
+        self._candidates = 0
         self._collision: SelfCollision | None = None
         self._hand_contact: HandContact | None = None
         self._recordings = {
@@ -194,6 +195,8 @@ class Simulator:
         frame: int,
         control_start: Float[ndarray, "control 3"],
         control_end: Float[ndarray, "control 3"],
+        *,
+        goes_on: bool = False,
     ) -> None:
         """Advance the state by one frame while the control nodes move on straight lines.
 
@@ -201,6 +204,8 @@ class Simulator:
             frame: Number of the frame that this reaches, which decides what is attached.
             control_start: Where the control nodes are at the start [m].
             control_end: Where they are at the end [m].
+            goes_on: Whether this is a later part of what was begun, in which the nodes and
+                triangles may touch that were near each other when it began.
 
         Raises:
             SimulationDivergedError: If a node is not finite or faster than `speed_limit`.
@@ -209,7 +214,7 @@ class Simulator:
             self.control_start.assign(np.ascontiguousarray(control_start, dtype=np.float32))
             self.control_end.assign(np.ascontiguousarray(control_end, dtype=np.float32))
         self.hold(frame)
-        self.replay_frame()
+        self.replay_frame(goes_on=goes_on)
         self.check_divergence(frame)
 
     def hold(self, frame: int) -> None:
@@ -279,17 +284,22 @@ class Simulator:
         """Return the control trajectory, or raise `ValueError` if it does not fit the model."""
         return checked_control(control, self.model.control_count)
 
-    def replay_frame(self) -> None:
-        """Advance the state on the device by one frame, with the controls on the device."""
+    def replay_frame(self, *, goes_on: bool = False) -> None:
+        """Advance the state on the device by one frame, with the controls on the device.
+
+        Args:
+            goes_on: As for `step_frame`.
+        """
         if not self.has_contacts and self.engine is not None:
             state = self.position, self.velocity
             self.engine.advance(state, state)
             return
         # Arrays of the launches cannot be allocated during capture.
         _ = self.sums, self.rod
-        version = self.find_candidates(self.position)
+        if not goes_on:
+            self._candidates = self.find_candidates(self.position)
         laws = self.collision is not None, self.hand_contact is not None
-        self._recordings[laws].replay(version)
+        self._recordings[laws].replay(self._candidates)
 
     @property
     def has_contacts(self) -> bool:
