@@ -4,9 +4,10 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.appearance.texture import colored_surface
@@ -22,6 +23,7 @@ from physhandi.errors import PhysHandiError, UsageError
 from physhandi.fitting.stored_edits import read_edits
 from physhandi.simulation.edits import Edits
 from physhandi.simulation.forces import (
+    push_forces,
     spring_strains,
     spring_tensions,
     virtual_forces,
@@ -185,8 +187,36 @@ class ObjectRollout:
         }
 
     def forces(self, frame: int) -> Float[ndarray, "node 3"]:
-        """Compute the sum of the virtual springs' forces on each object node [N]."""
-        return virtual_forces(self.model_in(frame), self.parameters, *self.state(frame))
+        """Compute the force of the hands on each object node [N].
+
+        It is the sum of its virtual springs' forces and, with `hand_pushes`, of `pushes`.
+        """
+        pull = virtual_forces(self.model_in(frame), self.parameters, *self.state(frame))
+        return pull + self.pushes(frame)[1] if self.is_pushed else pull
+
+    @property
+    def is_pushed(self) -> bool:
+        """Whether the surface of the hands pushes nodes."""
+        return self.parameters.hand_pushes and len(self.model.hand_face) > 0
+
+    def pushes(self, frame: int) -> tuple[Int[ndarray, " node"], Float[ndarray, "node 3"]]:
+        """Compute how the surface of the hands pushes each object node; see `push_forces`.
+
+        Returns:
+            Triangle of the hands that pushes each node, -1 for none, and forces [N].
+        """
+        return self._pushes(frame, self.state(frame))
+
+    def _pushes(
+        self, frame: int, state: tuple[ndarray, ndarray, ndarray, ndarray]
+    ) -> tuple[Int[ndarray, " node"], Float[ndarray, "node 3"]]:
+        """Compute the push at a moment on the way to a frame."""
+        restart, before = self.restart, max(frame - 1, 0)
+        is_first = restart is not None and frame == restart.frame + 1
+        position = restart.position if restart is not None and is_first else self.position[before]
+        start = np.asarray(position), np.asarray(self.control[before])
+        hand = state[2] + (np.asarray(self.control[frame]) - self.held_control(frame))
+        return push_forces(self.model_in(frame), self.parameters, state, hand, start)
 
     def spring_forces(self, frame: int) -> Float[ndarray, "virtual 3"]:
         """Compute the force of each virtual spring on its object node [N]."""
@@ -210,11 +240,16 @@ class ObjectRollout:
         return self.frame_means(spring_tensions, device)
 
     def mean_forces(self, device: str = "cpu") -> Float[ndarray, "frame node 3"]:
-        """Average the virtual springs' force on each node over the way to each frame [N].
+        """Average the force of the hands on each node over the way to each frame [N].
 
         As `mean_tensions`, for `forces`.
         """
-        return self.frame_means(virtual_forces, device)
+
+        def measure(frame: int, *state: Any) -> ndarray:
+            pull = virtual_forces(self.model_in(frame), self.parameters, *state)
+            return pull + self._pushes(frame, state)[1] if self.is_pushed else pull
+
+        return self._frame_means(measure, device)
 
     def frame_means(self, measure: Measure, device: str = "cpu") -> Float[ndarray, "frame ..."]:
         """Average what is measured of model and state over the substeps on the way to each frame.
@@ -233,6 +268,16 @@ class ObjectRollout:
         Raises:
             SimulationDivergedError: If the motion runs away.
         """
+
+        def measured(frame: int, *state: Any) -> ndarray:
+            return measure(self.model_in(frame), self.parameters, *state)
+
+        return self._frame_means(measured, device)
+
+    def _frame_means(
+        self, measure: Callable[..., ndarray], device: str
+    ) -> Float[ndarray, "frame ..."]:
+        """Average as `frame_means` what is measured of a frame and the state at a moment."""
         from physhandi.simulation.simulator import Simulator
 
         given = self.parameters
@@ -241,11 +286,11 @@ class ObjectRollout:
         finer = given.replace(frame_duration=duration, substeps_per_frame=each)
         simulator = Simulator(self.model, finer, device)
         simulator.reset(*(self.start or ()))
-        means = [np.asarray(measure(self.model_in(0), given, *self.state(0)), np.float64)]
+        means = [np.asarray(measure(0, *self.state(0)), np.float64)]
         for frame in range(1, self.ready):
             if self.restart is not None and frame == self.restart.frame + 1:
                 simulator.continue_from(self.restart, *self._strained(self.restart))
-            model, (_, _, end, moving) = self.model_in(frame), self.state(frame)
+            _, _, end, moving = self.state(frame)
             begin = end - (self.control[frame] - self.control[frame - 1])
             mean, before = np.zeros_like(means[0]), begin
             for stop in range(count + 1):
@@ -254,7 +299,7 @@ class ObjectRollout:
                     simulator.step_frame(frame, before, place, goes_on=stop > 1)
                 state = simulator.position.numpy(), simulator.velocity.numpy(), place, moving
                 weight = (0.5 if stop in {0, count} else 1.0) / count
-                mean = mean + weight * np.asarray(measure(model, given, *state), np.float64)
+                mean = mean + weight * np.asarray(measure(frame, *state), np.float64)
                 before = place
             means.append(mean)
         return np.stack(means)

@@ -76,7 +76,7 @@ QUANTITIES: Mapping[Coloring, Quantity] = {
     "speed": Quantity(label="Speed", about="Of nodes; along a spring that of its ends", unit="m/s"),
     "force": Quantity(
         label="Force",
-        about="Pull of a spring; at a node the sum of the forces by which the hand holds it",
+        about="Pull of a spring; at a node the sum of the forces of the hand on it",
         unit="N",
     ),
     "difference": Quantity(

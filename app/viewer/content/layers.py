@@ -55,7 +55,7 @@ class Layers:
     object_springs: bool = False
     """Springs between object nodes."""
     forces: bool = True
-    """Sum of the virtual springs' forces on each object node."""
+    """Force of the hands on each object node."""
     observed: bool = False
     """Observed points."""
     cameras: bool = True

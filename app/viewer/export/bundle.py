@@ -244,7 +244,7 @@ _ABOUT = (
     ("picture.png", "picture.png      the view"),
     ("views/", "views/*.png      what the recording's cameras saw in this frame, if there are any"),
     ("frame.ply", "frame.ply        nodes, hands and virtual springs (edges) of this frame"),
-    ("nodes.csv", "nodes.csv        object nodes: place, and sum of the virtual springs' forces"),
+    ("nodes.csv", "nodes.csv        object nodes: place, and force of the hands"),
     ("controls.csv", "controls.csv     control nodes: place, springs that they hold"),
     ("springs.csv", "springs.csv      all springs: ends, length, rest length, strain, stiffness"),
     ("forces.csv", "forces.csv       force of each virtual spring on its object node"),

@@ -134,7 +134,7 @@ def snapshot_npz(snapshot: Snapshot) -> bytes:
     Of a comparison all frames of both sides, as in ``ours_…`` and ``phystwin_…`` or ``a_…`` and
     ``b_…``: ``position`` "frame node 3" and ``control`` "frame control 3" [m], ``spring_nodes``,
     ``rest_length`` [m], ``stiffness`` [N], ``object_spring_count``, ``force`` "frame node 3" [N],
-    the sum over virtual springs on each object node, and ``frame``, the frame on the screen; of a
+    that of the hands on each object node, and ``frame``, the frame on the screen; of a
     rollout that restarts also what `ObjectRollout.restart_arrays` gives, and of one whose virtual
     springs do not always act ``attached`` "virtual 2", the frame in whose state each is attached
     and the last one before it lets go.

@@ -111,8 +111,10 @@ def virtual_springs_at(rollout: ObjectRollout, point: int, frame: int) -> Int[nd
 
 
 def reduced(rollout: ObjectRollout, pick: Pick) -> ObjectRollout:
-    """Keep only the springs that matter to a thing, so that all its frames are read quickly."""
+    """Keep only what matters to a thing, so that all its frames are read quickly."""
     smaller = _with_springs(rollout.model, _springs_of(rollout, pick))
+    if pick.kind != "node":
+        smaller = replace(smaller, hand_face=smaller.hand_face[:0])
     return replace(rollout, model=smaller, hand_shift=rollout.shift_of_hands())
 
 
@@ -142,6 +144,8 @@ def _mean_force(rollout: ObjectRollout, pick: Pick) -> Float[ndarray, " frame"]:
     """Average the pull of a spring, or the force on a node or control node, between frames [N]."""
     if not rollout.is_complete:
         return np.full(rollout.ready, np.nan)
+    if pick.kind == "node" and rollout.is_pushed:
+        return np.linalg.norm(rollout.mean_forces()[:, pick.index], axis=1)
     chosen = _springs_of(rollout, pick)
 
     def measure(model: SpringMassModel, *state: Any) -> ndarray:
@@ -188,8 +192,8 @@ def _attached_rows(model: SpringMassModel, spring: int) -> "Rows":
 class HandLoad:
     """Action of a hand on the object in one frame."""
 
-    held: int
-    """Object nodes that it holds."""
+    touched: int
+    """Object nodes that it holds or pushes."""
     force: Float[ndarray, " 3"]
     """Sum of its forces [N]."""
     strongest: float
@@ -199,27 +203,27 @@ class HandLoad:
 
 
 def hand_load(
-    force: Float[ndarray, "spring 3"],
+    force: Float[ndarray, "force 3"],
     *,
-    node: Int[ndarray, " spring"],
+    node: Int[ndarray, " force"],
     position: Float[ndarray, "node 3"],
     about: Float[ndarray, " 3"],
 ) -> HandLoad:
-    """Sum up the forces of virtual springs on object nodes.
+    """Sum up the forces of virtual springs, or of a hand's surface, on object nodes.
 
     Args:
-        force: Of each spring on its node [N].
-        node: Node of each spring.
+        force: Each of them [N].
+        node: Node on which each acts.
         position: Object nodes [m].
         about: Point that moments are about [m].
     """
-    held, at = np.unique(node, return_inverse=True)
-    of_node = np.zeros((len(held), 3))
+    touched, at = np.unique(node, return_inverse=True)
+    of_node = np.zeros((len(touched), 3))
     np.add.at(of_node, at, force)
-    is_held = np.linalg.norm(of_node, axis=1) > 0.0
-    arm = position[held] - about
+    is_touched = np.linalg.norm(of_node, axis=1) > 0.0
+    arm = position[touched] - about
     return HandLoad(
-        held=int(is_held.sum()),
+        touched=int(is_touched.sum()),
         force=of_node.sum(axis=0),
         strongest=float(np.linalg.norm(of_node, axis=1).max(initial=0.0)),
         moment=np.cross(arm, of_node).sum(axis=0).reshape(3),
@@ -337,6 +341,8 @@ class Readings:
         force = rollout.spring_forces(rollout_frame)[held - own].sum(axis=0)
         newtons = self._painter.force_factor
         if pick.kind == "node":
+            if rollout.is_pushed:
+                force = force + rollout.pushes(rollout_frame)[1][pick.index]
             rows.append(
                 (
                     f"force of the {'hand' if self._content.hands else 'controls'}",
@@ -361,15 +367,22 @@ class Readings:
         model = rollout.model
         ends = model.spring_nodes[model.object_spring_count :]
         is_own = np.isin(ends.max(axis=1) - model.node_count, controls)
+        force, node = rollout.spring_forces(frame)[is_own], ends[is_own].min(axis=1)
+        verb = "holds"
+        if rollout.is_pushed:
+            face, push = rollout.pushes(frame)
+            pushed = np.flatnonzero((face >= 0) & np.isin(model.hand_face[face, 0], controls))
+            force, node = np.concatenate([force, push[pushed]]), np.concatenate([node, pushed])
+            verb = "holds and pushes"
         load = hand_load(
-            self._painter.force_factor * rollout.spring_forces(frame)[is_own],
-            node=ends[is_own].min(axis=1),
+            self._painter.force_factor * force,
+            node=node,
             position=np.asarray(rollout.position[frame], dtype=np.float64),
             about=np.asarray(rollout.held_control(frame)[controls].mean(axis=0), np.float64),
         )
         unit, factor = length_unit(self._content)
         return [
-            (f"{hand.side} hand", f"holds {load.held} nodes"),
+            (f"{hand.side} hand", f"{verb} {load.touched} nodes"),
             ("its force", self._vector(load.force, "N", size=True)),
             ("its strongest", f"{number(load.strongest)} N on a node"),
             ("its moment", self._vector(factor * load.moment, f"N·{unit}", size=True)),

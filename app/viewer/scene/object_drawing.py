@@ -73,7 +73,7 @@ def share_bytes(left: int, rollout: ObjectRollout, layers: Layers, arrows: int) 
 
 
 def strengths(rollout: ObjectRollout) -> Float[ndarray, " node"]:
-    """Sample how hard the virtual springs pull the nodes that they hold, over the frames [N]."""
+    """Sample how hard the hands pull and push the nodes that they touch, over the frames [N]."""
     frames = np.unique(np.linspace(0, rollout.ready - 1, _SAMPLED_FRAMES).astype(int))
     strength = np.concatenate([np.linalg.norm(rollout.forces(int(f)), axis=-1) for f in frames])
     return strength[strength > QUIET_FORCE]
@@ -299,7 +299,7 @@ def virtual_springs_in(model: SpringMassModel, frame: int | None) -> Int[ndarray
 def force_arrows(
     rollout: ObjectRollout, frame: int, force_unit: float, longest: float, most: int
 ) -> Float[ndarray, "arrow 2 3"]:
-    """Lay out the forces that the hand puts on the object through the virtual springs.
+    """Lay out the forces that the hands put on the object: through virtual springs, and pushes.
 
     Args:
         rollout: The rollout.

@@ -91,7 +91,7 @@ class SceneData:
     )
     """Bones and weights of the hands that have them, by side; see `read_skins`."""
     forces: Callable[[int], Float[ndarray, "node 3"]] | None = None
-    """Sums the virtual springs' forces on each node in a frame, for nodes of 1 kg [N]; None if they
+    """Gives the force of the hands on each node in a frame, for nodes of 1 kg [N]; None if forces
     are not known."""
     views: tuple[View, ...] = ()
     """Recorded views, if they are there."""

@@ -10,23 +10,17 @@ import warp as wp
 
 from physhandi.simulation.kernels.contacts import SLIDING_SPEED
 from physhandi.simulation.kernels.integration import spring_sum
+from physhandi.simulation.kernels.push_constants import (
+    FARTHEST_FACE,
+    LEAVING_SPEED,
+    MOST_ASIDE,
+    MOST_DEPTH,
+    SAME_DISTANCE,
+)
 from physhandi.simulation.kernels.world import World
 
 wp.set_module_options({"enable_backward": False})
 
-FARTHEST_FACE = wp.constant(6.0)
-"""Farthest that a node may be from its triangle, in lengths of the triangle's longest edge."""
-MOST_DEPTH = wp.constant(3.0)
-"""Deepest that a node may be inside of the hand, in the same lengths: what is deeper is nearer to
-another side of the hand, out of which it must not be pushed."""
-MOST_ASIDE = wp.constant(0.7)
-"""Farthest that a node may be beside its triangle, seen along the normal, in the same lengths:
-beyond the rim of a hand the plane goes on, but the hand does not."""
-SAME_DISTANCE = wp.constant(1.0e-4)
-"""Relative difference below which two triangles count as equally near, as those that share the
-nearest edge do; the one whose plane is farther away then tells inside from outside."""
-LEAVING_SPEED = wp.constant(0.1)
-"""The s of the law: what a hand pushes never leaves it faster than this [m/s]."""
 SMALLEST_AREA = wp.constant(1.0e-12)
 """Least double area of a triangle that is divided by [m²]."""
 

@@ -102,10 +102,10 @@ def test_what_a_hand_does_is_summed_over_its_springs() -> None:
         position=position,
         about=np.zeros(3),
     )
-    assert (load.held, load.strongest) == (2, 4.0)
+    assert (load.touched, load.strongest) == (2, 4.0)
     assert load.force.tolist() == [0.0, 0.0, 3.0]
     # (1, 0, 0) x (0, 0, 4) = (0, -4, 0) and (0, 2, 0) x (0, 0, -1) = (-2, 0, 0).
     assert load.moment.tolist() == [-2.0, -4.0, 0.0]
     none = np.zeros((0, 3))
     empty = hand_load(none, node=np.zeros(0, np.int64), position=position, about=np.zeros(3))
-    assert (empty.held, empty.strongest, empty.moment.tolist()) == (0, 0.0, [0.0, 0.0, 0.0])
+    assert (empty.touched, empty.strongest, empty.moment.tolist()) == (0, 0.0, [0.0, 0.0, 0.0])

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from reference.scenes import as_model, bare_scene, cube_scene
-from reference.spring_mass import incidence, spring_force
+import pytest
+from reference.scenes import as_model, bare_scene, cube_scene, pressed_scene
+from reference.spring_mass import incidence, pushes, simulate, spring_force
 
 from physhandi.simulation.forces import (
     node_means,
+    push_forces,
     spring_strains,
     spring_tensions,
     virtual_forces,
@@ -108,3 +110,26 @@ def test_tensions_add_up_to_the_oracle_s_forces():
 def test_a_node_without_object_springs_has_no_mean():
     model, _ = as_model(bare_scene([[0.0, 0, 0], [1, 0, 0]]))
     assert np.isnan(node_means(model, np.zeros(0))).all()
+
+
+@pytest.mark.parametrize("changes", [{}, {"hand_friction": 2.0}, {"gravity": 9.81}])
+def test_pushes_are_the_oracle_s_with_the_triangles_of_the_frame_s_start(changes):
+    scene, beside = pressed_scene(**changes), []
+    position, velocity = simulate(scene, beside=beside)
+    model, parameters = as_model(scene)
+    count, held = len(scene.node), scene.control[3]
+    state = position[3], velocity[3], held, (held - scene.control[2]) * 30.0
+    points = np.vstack([state[0], held]), np.vstack([state[1], state[3]])
+    force = spring_force(scene, incidence(scene, len(points[0])), *points)[:count]
+    expected = pushes(scene, beside[2], state[:2], force, held, state[3])
+    start = position[2], scene.control[2]
+    face, push = push_forces(model, parameters, state, held, start)
+    is_pushed = expected.any(axis=1)
+    assert is_pushed.sum() > 2
+    assert np.abs(expected).max() > 50.0
+    np.testing.assert_allclose(push, expected, atol=1e-6)
+    np.testing.assert_array_equal(face[is_pushed], beside[2][0][is_pushed])
+    assert (face[~is_pushed] == -1).all()
+    # Triangles that were found later are others.
+    later = push_forces(model, parameters, state, held, (position[3], held))[1]
+    assert np.abs(later - push).max() > 1.0
