@@ -18,8 +18,6 @@ import socket
 import subprocess
 import sys
 import tarfile
-import time
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -28,6 +26,7 @@ from typing import Any, get_args
 
 import numpy as np
 from support.server import surface
+from support.waiting import until
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from pydantic import SecretStr
@@ -255,15 +254,6 @@ def command_line(*arguments: str) -> str:
             if end.code:
                 raise RuntimeError(f"{arguments} ended with {end.code}: {told.getvalue()}") from end
     return printed.getvalue()
-
-
-def until(is_reached: Callable[[], bool]) -> None:
-    """Wait for what other processes do."""
-    end = time.monotonic() + 300.0
-    while not is_reached():
-        if time.monotonic() > end:
-            raise RuntimeError("it did not come to that within five minutes")
-        time.sleep(0.1)
 
 
 def make_runs_by_commands(data: Path) -> None:

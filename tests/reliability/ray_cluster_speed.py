@@ -9,6 +9,7 @@ import psutil
 from support.inputs.sheet_sequence import write_sheet
 from support.server.ray_cluster import RAY, RealCluster, real_cluster
 from support.server.suite_world import SETTINGS
+from support.waiting import until
 
 from app.jobs.catalog import Catalog
 from app.jobs.processes import WORKER
@@ -63,8 +64,8 @@ def _batch(count: int, folder: Path, cluster: RealCluster) -> tuple[list[Run], f
     begin = time.monotonic()
     scheduler.start()
     try:
-        while not all(state_of(scheduler, run) in ENDED for run in runs):
-            time.sleep(0.1)
+        for run in runs:
+            until(lambda run=run: state_of(scheduler, run) in ENDED, interval=0.1)
     finally:
         scheduler.shutdown()
     return runs, time.monotonic() - begin
