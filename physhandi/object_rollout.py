@@ -159,6 +159,11 @@ class ObjectRollout:
             self.hand_shift = restart.hand_shift(self.model, own)
         return self.hand_shift
 
+    def _restart_before(self, frame: int) -> Restart | None:
+        """Give the restart if the frame is the first one after it."""
+        restart = self.restart
+        return restart if restart is not None and frame == restart.frame + 1 else None
+
     def _strained(self, restart: Restart) -> tuple[ndarray, ndarray]:
         """Give object and control nodes in the frames whose strain a restart keeps [m]."""
         frames = slice(restart.strained_frames.start, restart.strained_frames.stop)
@@ -191,8 +196,12 @@ class ObjectRollout:
 
         It is the sum of its virtual springs' forces and, with `hand_pushes`, of `pushes`.
         """
-        pull = virtual_forces(self.model_in(frame), self.parameters, *self.state(frame))
-        return pull + self.pushes(frame)[1] if self.is_pushed else pull
+        return self._hand_forces(frame, *self.state(frame))
+
+    def _hand_forces(self, frame: int, *state: ndarray) -> Float[ndarray, "node 3"]:
+        """Compute the force of the hands on each node at a moment on the way to a frame [N]."""
+        pull = virtual_forces(self.model_in(frame), self.parameters, *state)
+        return pull + self._pushes(frame, *state)[1] if self.is_pushed else pull
 
     @property
     def is_pushed(self) -> bool:
@@ -205,18 +214,23 @@ class ObjectRollout:
         Returns:
             Triangle of the hands that pushes each node, -1 for none, and forces [N].
         """
-        return self._pushes(frame, self.state(frame))
+        return self._pushes(frame, *self.state(frame))
 
     def _pushes(
-        self, frame: int, state: tuple[ndarray, ndarray, ndarray, ndarray]
+        self, frame: int, *state: ndarray
     ) -> tuple[Int[ndarray, " node"], Float[ndarray, "node 3"]]:
         """Compute the push at a moment on the way to a frame."""
-        restart, before = self.restart, max(frame - 1, 0)
-        is_first = restart is not None and frame == restart.frame + 1
-        position = restart.position if restart is not None and is_first else self.position[before]
-        start = np.asarray(position), np.asarray(self.control[before])
-        hand = state[2] + (np.asarray(self.control[frame]) - self.held_control(frame))
-        return push_forces(self.model_in(frame), self.parameters, state, hand, start)
+        position, velocity, control, control_velocity = state
+        before, restart = max(frame - 1, 0), self._restart_before(frame)
+        first = self.position[before] if restart is None else restart.position
+        hand = control + (np.asarray(self.control[frame]) - self.held_control(frame))
+        return push_forces(
+            self.model_in(frame),
+            self.parameters,
+            (position, velocity, control, control_velocity),
+            hand,
+            (np.asarray(first), np.asarray(self.control[before])),
+        )
 
     def spring_forces(self, frame: int) -> Float[ndarray, "virtual 3"]:
         """Compute the force of each virtual spring on its object node [N]."""
@@ -244,12 +258,7 @@ class ObjectRollout:
 
         As `mean_tensions`, for `forces`.
         """
-
-        def measure(frame: int, *state: Any) -> ndarray:
-            pull = virtual_forces(self.model_in(frame), self.parameters, *state)
-            return pull + self._pushes(frame, state)[1] if self.is_pushed else pull
-
-        return self._frame_means(measure, device)
+        return self._frame_means(self._hand_forces, device)
 
     def frame_means(self, measure: Measure, device: str = "cpu") -> Float[ndarray, "frame ..."]:
         """Average what is measured of model and state over the substeps on the way to each frame.
@@ -288,8 +297,9 @@ class ObjectRollout:
         simulator.reset(*(self.start or ()))
         means = [np.asarray(measure(0, *self.state(0)), np.float64)]
         for frame in range(1, self.ready):
-            if self.restart is not None and frame == self.restart.frame + 1:
-                simulator.continue_from(self.restart, *self._strained(self.restart))
+            restart = self._restart_before(frame)
+            if restart is not None:
+                simulator.continue_from(restart, *self._strained(restart))
             _, _, end, moving = self.state(frame)
             begin = end - (self.control[frame] - self.control[frame - 1])
             mean, before = np.zeros_like(means[0]), begin
@@ -317,8 +327,8 @@ class ObjectRollout:
 
     def _mean_velocity(self, frame: int) -> Float[ndarray, "node 3"]:
         """Velocity of the nodes during the frame's substeps, from their positions [m/s]."""
-        restart, rate = self.restart, self.parameters.frame_rate
-        if restart is None or frame != restart.frame + 1:
+        restart, rate = self._restart_before(frame), self.parameters.frame_rate
+        if restart is None:
             return _difference(self.position, frame, rate)
         return _difference(np.stack([restart.position, self.position[frame]]), 1, rate)
 

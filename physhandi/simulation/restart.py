@@ -28,8 +28,8 @@ FIRM_HOLD = 4
 """Virtual springs that fix the place of a node, whatever hangs on it."""
 COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
-_CHOICES = ("moves_hands", "eases_grips")
-_OPTIONAL = (*_CHOICES, "strain_frames")
+_OPTIONAL = {"moves_hands": 0, "eases_grips": 0, "strain_frames": 1}
+"""Single numbers that a stored restart may lack, and what they are then."""
 
 NodeState = tuple[Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]
 """Positions [m] and velocities [m/s] of the object nodes."""
@@ -207,14 +207,13 @@ class Restart:
         """
         needed = {"frame", "position", "velocity"}
         if not needed <= set(tensors) <= needed | set(_OPTIONAL):
+            *others, last = _OPTIONAL
             raise ValueError(
                 "A restart needs the arrays frame, position and velocity, and may have "
-                f"{', '.join(_OPTIONAL[:-1])} and {_OPTIONAL[-1]}; got "
-                f"{', '.join(sorted(tensors))}."
+                f"{', '.join(others)} and {last}; got {', '.join(sorted(tensors))}."
             )
-        absent = dict.fromkeys(_CHOICES, 0) | {"strain_frames": 1}
         single = {
-            name: np.asarray(tensors.get(name, absent.get(name))).reshape(-1)
+            name: np.asarray(tensors.get(name, _OPTIONAL.get(name))).reshape(-1)
             for name in ("frame", *_OPTIONAL)
         }
         for name, value in single.items():

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from reference.scenes import as_model, crossing_scene, pressed_scene
 from reference.spring_mass import Scene
-from support.physics.palm import WEIGHT, on_a_palm
+from support.physics.palm import WEIGHT, on_a_palm, simulated
 
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.forces import virtual_forces
 from physhandi.simulation.restart import Restart
-from physhandi.simulation.simulator import Simulator
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +58,7 @@ def test_a_restart_that_moves_what_springs_hold_leaves_the_surface(resting: Obje
 
 @pytest.mark.parametrize("scene", [pressed_scene(), crossing_scene()], ids=["pushed", "colliding"])
 def test_averages_are_of_the_rollout_s_own_motion_though_what_touches_changes(scene: Scene) -> None:
-    rollout, places = simulated(scene), []
+    rollout, places = rollout_of(scene), []
 
     def remember(model, parameters, position, *_) -> np.ndarray:
         places.append(position.copy())
@@ -72,7 +71,7 @@ def test_averages_are_of_the_rollout_s_own_motion_though_what_touches_changes(sc
 
 
 def test_pushes_are_averaged_beside_springs() -> None:
-    rollout = simulated(pressed_scene())
+    rollout = rollout_of(pressed_scene())
     mean, springs = rollout.mean_forces()[3], rollout.frame_means(virtual_forces)[3]
     pushed = rollout.pushes(3)[0] >= 0
     assert pushed.sum() > 2
@@ -83,11 +82,5 @@ def test_pushes_are_averaged_beside_springs() -> None:
     assert (np.linalg.norm(springs, axis=1) > 0.0).sum() == 1
 
 
-def simulated(scene: Scene) -> ObjectRollout:
-    model, parameters = as_model(scene)
-    rollout = ObjectRollout.empty(model, parameters, scene.control.astype(np.float32))
-    assert rollout.velocity is not None
-    for frame, position, velocity in Simulator(model, parameters).frames(rollout.control):
-        rollout.position[frame], rollout.velocity[frame] = position, velocity
-    rollout.ready = rollout.frame_count
-    return rollout
+def rollout_of(scene: Scene) -> ObjectRollout:
+    return simulated(*as_model(scene), scene.control.astype(np.float32))

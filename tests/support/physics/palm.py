@@ -36,10 +36,16 @@ def on_a_palm(frames: int = 12, **settings: Any) -> ObjectRollout:
     )
     given = {"hand_pushes": True, "ground_height": None, "substeps_per_frame": 100} | settings
     parameters = SimulationParameters(**given)
-    rollout = ObjectRollout.empty(model, parameters, np.repeat(corner[None], frames, axis=0))
-    simulator = Simulator(model, parameters)
+    return simulated(model, parameters, np.repeat(corner[None], frames, axis=0))
+
+
+def simulated(
+    model: SpringMassModel, parameters: SimulationParameters, control: np.ndarray
+) -> ObjectRollout:
+    """Simulate all frames of a control trajectory into a rollout."""
+    rollout = ObjectRollout.empty(model, parameters, control)
     assert rollout.velocity is not None
-    for frame, position, velocity in simulator.frames(rollout.control):
+    for frame, position, velocity in Simulator(model, parameters).frames(control):
         rollout.position[frame], rollout.velocity[frame] = position, velocity
-    rollout.ready = frames
+    rollout.ready = rollout.frame_count
     return rollout
