@@ -44,6 +44,10 @@ _TRUST = {True: 0.1, False: 0.02}
 expected time; the first if those had the same settings and machine."""
 _DEPTH_COST = 15.0
 """Cost of an update of the hand with depth, in updates without (measured: 14 to 18)."""
+_STEP_COST = 8.0
+"""Cost of a step of Gauss and Newton, in updates of gradient descent without depth."""
+_STEPS, _DEPTH_STEPS = 15, 20
+"""Steps that a hand takes, and those with depth in steps without (measured: 13 to 26, 4 to 8)."""
 _GRADIENT_COST = 3.0
 """Cost of a gradient, in simulations."""
 _PICTURE_COST = 5.0
@@ -93,7 +97,11 @@ def work_of(config: PipelineConfig, extent: Extent) -> dict[str, float]:
     hand, search = config.hand, config.object_.search
     # Without a number of candidates pycma takes so many.
     population = search.population or 4 + int(3 * math.log(max(1, len(search.variables))))
-    hands = {HANDS: extent.hand_frames * (hand.iterations + _DEPTH_COST * hand.depth_iterations)}
+    updates = hand.iterations + _DEPTH_COST * hand.depth_iterations
+    if hand.gauss_newton:
+        steps = min(hand.iterations, _STEPS) + min(hand.depth_iterations, _DEPTH_STEPS)
+        updates = _STEP_COST * steps
+    hands = {HANDS: extent.hand_frames * updates}
     if not extent.has_object:
         return hands | {EVALUATION: float(extent.frames)}
     rollout = _frame_cost(config) * extent.frames

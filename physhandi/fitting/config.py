@@ -62,12 +62,18 @@ class HandFitConfig(Settings, frozen=True, kw_only=True):
 
     model: Literal["open", "mano"] = "open"
     """Hand model to fit: the built-in open hand, or MANO that `physhandi import mano` imported."""
+    gauss_newton: bool = True
+    """Whether updates are damped steps of Gauss and Newton in the place of gradient descent. A
+    dozen of them come nearer to the best hand than hundreds of the others."""
     iterations: Annotated[int, Meta(ge=1, le=100_000)] = 500
-    """Updates of the fit to keypoints."""
+    """Updates of the fit to keypoints. Gauss and Newton's end when the loss falls no more, or after
+    40."""
     depth_iterations: Count = 150
-    """Updates of the fit to keypoints and depth that follow, if a view has depth and masks."""
+    """Updates of the fit to keypoints and depth that follow, if a view has depth and masks;
+    likewise."""
     learning_rate: Rate = 0.03
-    """First step size of the joints [rad]; it falls to a twentieth along a cosine."""
+    """First step size of the joints in gradient descent [rad]; it falls to a twentieth along a
+    cosine."""
     depth_learning_rate: Rate = 0.03
     """The same for the fit to keypoints and depth."""
     starts_at_depth: bool = True
@@ -81,7 +87,8 @@ class HandFitConfig(Settings, frozen=True, kw_only=True):
     units of the expected depth error, squared."""
     fixed_normals: bool = True
     """Whether the hand's normals stay as they are between two searches for the vertices that
-    measured points correspond to. Only these vertices are computed then, which is much faster."""
+    measured points correspond to, as they always do in steps of Gauss and Newton. Only these
+    vertices are computed then, which is much faster."""
     judges_keypoints: bool = True
     """Whether keypoints lose their weight that contradict what other views triangulate, and all of
     a view's keypoints of a hand if most of them do."""

@@ -1,9 +1,10 @@
 """Stage 1: reconstructs the hands of a sequence from keypoints and depth (paper, 3.2).
 
 `reconstruct_hands` fits one hand after the other: `guess_wrist` places the palm in every frame,
-then `HandProblem` refines pose and shape by gradient descent, first on the keypoints, then on
-keypoints and depth; its motion may be smoothed in the end. Where one view alone places the palm,
-and depth was measured, `search_hand` takes the place of the fit to keypoints.
+then `HandProblem` refines pose and shape by steps of Gauss and Newton or by gradient descent, first
+on the keypoints, then on keypoints and depth; its motion may be smoothed in the end. Where one view
+alone places the palm, and depth was measured, `search_hand` takes the place of the fit to
+keypoints.
 """
 
 import math
@@ -25,17 +26,22 @@ from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.checks.readiness import REMEDIES, missing_for_hands
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.hands.agreement import believed_keypoints
+from physhandi.fitting.hands.gauss_newton import DampedSteps, NormalEquations, PoseRates
 from physhandi.fitting.hands.left_right import hands_in_place
 from physhandi.fitting.hands.losses import (
     DEPTH_DOUBT,
     REFRESH,
     correspond,
     depth_loss,
+    distance_curvature,
     distance_loss,
+    free_space_curvature,
     free_space_loss,
     hand_acceleration_loss,
     keypoint_costs,
+    limit_curvature,
     limit_loss,
+    reprojection_curvature,
     reprojection_loss,
     velocity_loss,
 )
@@ -48,6 +54,7 @@ from physhandi.fitting.hands.observed import (
     keypoint_target,
 )
 from physhandi.fitting.hands.poses import (
+    NARROWS,
     PosedHands,
     doubt_breadth,
     hand_optimizer,
@@ -69,8 +76,12 @@ from physhandi.one_thread import one_thread
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import NullProgress, Preview, Progress
 
-_Step = Callable[[int, Tensor, Adam | None], None]
+_Step = Callable[[int, Tensor, Adam | DampedSteps | None], None]
 """Receives the number of an update, its loss, and the optimizer if it can be stored."""
+_MOST_STEPS = 40
+"""Most steps of Gauss and Newton to keypoints, and as many to keypoints and depth."""
+_NARROWING_STEPS = 10.0
+"""Steps over which keypoint errors that far off still pull become fewer."""
 HAND_STAGE = "hand_reconstruction"
 """Name of the stage in progress reports."""
 
@@ -88,7 +99,7 @@ class HandFit:
     loss_after: float
     """Loss of the result, without depth."""
     curve: list[tuple[int, float]] = field(default_factory=list)
-    """Loss of every tenth iteration, summed over the hands."""
+    """Loss of every tenth iteration or of every step of Gauss and Newton, summed over hands."""
     left_out: Mapping[HandSide, str] = field(default_factory=dict)
     """Hands that no frame shows well enough to place them, and why; they have no motion."""
 
@@ -110,7 +121,7 @@ def reconstruct_hands(
     Args:
         sequence: The recording; its `hands` are fitted.
         config: Settings of the fit.
-        progress: Receives a report every tenth iteration.
+        progress: Receives a report every tenth iteration, or every step of Gauss and Newton.
         keypoint: Keypoints to fit to [px]; None takes those of `observed_keypoints`.
         checkpointer: Keeps the state of each hand's fit; None keeps nothing.
 
@@ -148,8 +159,12 @@ def reconstruct_hands(
             raise FitError(f"Sequence '{sequence.name}': {error}") from error
     if not fits:
         raise FitError(f"Sequence '{sequence.name}': {' '.join(left_out.values())}")
-    losses = zip(*(fit.curve for fit in fits), strict=False)
-    curve = [(at[0][0], float(sum(loss for _, loss in at))) for at in losses]
+    # A hand whose fit ended earlier stays as it is.
+    longest = max((fit.curve for fit in fits), key=len)
+    curve = [
+        (iteration, float(sum(fit.curve[min(at, len(fit.curve) - 1)][1] for fit in fits)))
+        for at, (iteration, _) in enumerate(longest)
+    ]
     return HandFit(
         motions=tuple(fit.motion for fit in fits),
         keypoint=keypoint.astype(np.float32),
@@ -184,6 +199,20 @@ class SolvedHand:
     loss_before: float
     loss_after: float
     curve: list[tuple[int, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Descent:
+    """Updates of one loss."""
+
+    iterations: int
+    """Most of them."""
+    rate: float
+    """First step size of the joints in gradient descent [rad]."""
+    breadth: Callable[[int], float]
+    """From which keypoint error on the pull falls, in units of noise, by the number of updates."""
+    depth: DepthTarget | None
+    """Measured points; None if keypoints alone are fitted."""
 
 
 class HandProblem:
@@ -269,20 +298,24 @@ class HandProblem:
     def depth_term(self, target: DepthTarget) -> Tensor:
         """Compute the weighted depth loss."""
         hands, noise = self._hands, self.config.depth_noise
-        if not self.config.fixed_normals:
+        if not (self.config.fixed_normals or self.config.gauss_newton):
             faces = torch.from_numpy(self.model.faces)
             return self.config.depth_weight * depth_loss(hands.surface(), faces, target, noise)
-        if target.vertex is None or target.normal is None or target.age >= REFRESH:
-            with torch.no_grad():
-                surface = hands.surface()
-                normal = hands.normals(surface)
-                target.vertex, target.age = correspond(surface, normal, target), 0
-                index = target.vertex[..., None].expand(-1, -1, 3)
-                target.normal = normal.gather(1, index)
+        vertex, normal = target.vertex, target.normal
+        if vertex is None or normal is None or target.age >= REFRESH:
+            vertex, normal = self._look(target)
         target.age += 1
-        offset = target.point - hands.vertices(target.vertex)
-        loss = distance_loss(offset, target.normal, target.weight, noise)
-        return self.config.depth_weight * loss
+        offset = target.point - hands.vertices(vertex)
+        return self.config.depth_weight * distance_loss(offset, normal, target.weight, noise)
+
+    @torch.no_grad()
+    def _look(self, target: DepthTarget) -> tuple[Tensor, Tensor]:
+        """Look for the vertices that measured points correspond to, and their normals."""
+        surface = self._hands.surface()
+        normal = self._hands.normals(surface)
+        target.vertex, target.age = correspond(surface, normal, target), 0
+        target.normal = normal.gather(1, target.vertex[..., None].expand(-1, -1, 3))
+        return target.vertex, target.normal
 
     def solve(self, progress: Progress, checkpointer: Checkpointer) -> SolvedHand:
         """Fit to keypoints, then to keypoints and depth."""
@@ -290,10 +323,10 @@ class HandProblem:
         with torch.no_grad():
             before = float(self.loss(config.doubt))
         curve: list[tuple[int, float]] = []
-        total = self._first_iterations() + (config.depth_iterations if self.depth else 0)
+        total = self._first_iterations() + (self._depth_iterations() if self.depth else 0)
         loop = f"{HAND_STAGE}.{self.name}.{self.model.side}"
 
-        def state(optimizer: Adam) -> dict[str, ndarray]:
+        def state(optimizer: Adam | DampedSteps) -> dict[str, ndarray]:
             return optimizer.state() | self._depth_state() | {"curve": _curve_array(curve)}
 
         resumed = checkpointer.load(loop, state(self._optimizer(0.0)), growing=("curve",))
@@ -303,9 +336,10 @@ class HandProblem:
             note = f"{self.model.side.capitalize()} hand. {resumed_note(resumed.iteration)}"
             progress.report(HAND_STAGE, resumed.iteration, total, None, note)
 
-        def step(iteration: int, loss: Tensor, optimizer: Adam | None) -> None:
+        def step(iteration: int, loss: Tensor, optimizer: Adam | DampedSteps | None) -> None:
             progress.check_cancelled()
-            is_told, value = iteration % 10 == 0 or iteration == total, float(loss.detach())
+            is_told = iteration % 10 == 0 or iteration == total
+            is_told, value = is_told or isinstance(optimizer, DampedSteps), float(loss.detach())
             if is_told:
                 curve.append((iteration, value))
             if optimizer is not None:  # A search is short: it begins again.
@@ -332,8 +366,17 @@ class HandProblem:
         return SolvedHand(self._motion(), before, after, curve)
 
     def _first_iterations(self) -> int:
-        """Tell how many updates are made before those on keypoints and depth."""
-        return self.config.search_iterations if self._searched else self.config.iterations
+        """Tell how many updates are made at most before those on keypoints and depth."""
+        if self._searched:
+            return self.config.search_iterations
+        return self._at_most(self.config.iterations)
+
+    def _depth_iterations(self) -> int:
+        """Tell how many updates on keypoints and depth are made at most."""
+        return self._at_most(self.config.depth_iterations)
+
+    def _at_most(self, iterations: int) -> int:
+        return min(iterations, _MOST_STEPS) if self.config.gauss_newton else iterations
 
     def _search(self, hand: SearchedHand, step: _Step) -> None:
         """Begin with what a search finds."""
@@ -345,31 +388,23 @@ class HandProblem:
     def _fit(self, step: _Step, resumed: SavedState | None) -> None:
         """Descend on keypoints and place the hand by depth, or search; then descend on both."""
         config, depth, first = self.config, self.depth, self._first_iterations()
+        narrowing = NARROWS * config.iterations
+        if config.gauss_newton:
+            narrowing = min(narrowing, _NARROWING_STEPS)
 
-        def loss_at(iteration: int) -> Tensor:
-            return self.loss(doubt_breadth(config.doubt, iteration, config.iterations))
+        def breadth(iteration: int) -> float:
+            return doubt_breadth(config.doubt, iteration, narrowing)
 
         if self._searched is None and (resumed is None or resumed.iteration <= first):
-            self._descend(
-                config.iterations,
-                config.learning_rate,
-                loss_at,
-                step,
-                first=0,
-                resumed=resumed,
-            )
+            descent = _Descent(first, config.learning_rate, breadth, None)
+            self._descend(descent, step, first=0, resumed=resumed)
             resumed = None
             if depth is not None:
                 self._place_by_depth(depth)
         if depth is not None:
-            self._descend(
-                config.depth_iterations,
-                config.depth_learning_rate,
-                lambda _: self.loss_with_depth(depth),
-                step,
-                first=first,
-                resumed=resumed,
-            )
+            count, rate = self._depth_iterations(), config.depth_learning_rate
+            descent = _Descent(count, rate, lambda _: config.doubt, depth)
+            self._descend(descent, step, first=first, resumed=resumed)
 
     def _smooth(self) -> None:
         """Smooth the motion as far as the keypoints allow."""
@@ -413,27 +448,68 @@ class HandProblem:
             )
 
     def _descend(
-        self,
-        iterations: int,
-        rate: float,
-        loss_at: Callable[[int], Tensor],
-        step: _Step,
-        *,
-        first: int,
-        resumed: SavedState | None,
+        self, descent: _Descent, step: _Step, *, first: int, resumed: SavedState | None
     ) -> None:
-        optimizer, begin = self._optimizer(rate), 0
+        """Make updates, the first of which has the number after `first`."""
+        optimizer, begin = self._optimizer(descent.rate), 0
         if resumed is not None:
             optimizer.restore(resumed.tensors)
             begin = resumed.iteration - first
-        for iteration in range(begin, iterations):
-            optimizer.zero_grad()
-            loss = loss_at(iteration)
-            loss.backward()
-            optimizer.step(step_share(iteration, iterations))
-            step(first + iteration + 1, loss, optimizer)
+        for iteration in range(begin, descent.iterations):
+            number = first + iteration + 1
+            breadth = descent.breadth(iteration)
 
-    def _optimizer(self, rate: float) -> Adam:
+            def loss(breadth: float = breadth) -> Tensor:
+                depth = descent.depth
+                return self.loss(breadth) if depth is None else self.loss_with_depth(depth)
+
+            if isinstance(optimizer, Adam):
+                optimizer.zero_grad()
+                value = loss()
+                value.backward()
+                optimizer.step(step_share(iteration, descent.iterations))
+                step(number, value, optimizer)
+                continue
+            if descent.depth is not None:
+                self._look(descent.depth)
+            value = optimizer.update(loss, lambda at=breadth: self._curvature(at, descent.depth))
+            is_last = breadth <= self.config.doubt and optimizer.changes_nothing
+            step(first + descent.iterations if is_last else number, value, optimizer)
+            if is_last:
+                break
+
+    @torch.no_grad()
+    def _curvature(self, breadth: float, depth: DepthTarget | None) -> NormalEquations:
+        """Compute the curvature of the loss, or of the loss with depth."""
+        config, parameters, hands = self.config, self.parameters, self._hands
+        articulation, count = parameters["articulation"], len(parameters["articulation"])
+        rates, point = PoseRates(hands), hands.keypoints()
+        scale = parameters["log_scale"].exp()
+        equations = NormalEquations(count, fits_scale=not self.metric)
+        by_keypoint = rates.keypoints()
+        seen = scale**2 * reprojection_curvature(point * scale, self.target, breadth)
+        if depth is not None and self.space is not None:
+            free = free_space_curvature(point, self.space, config.depth_noise)
+            seen = seen + config.free_space_weight * free
+        equations.add_points(by_keypoint, seen, point)
+        reach = config.acceleration_noise / self.frame_rate**2
+        equations.add_accelerations(by_keypoint, 1 / reach**2 / count)
+        bent = config.limit_weight * limit_curvature(articulation, self.model)
+        turn = config.turn_noise * 30 / self.frame_rate
+        equations.add_angles(bent + 2 * config.pose_weight / count, 1 / turn**2 / count)
+        equations.add_shape(2 * config.shape_weight)
+        if depth is not None:
+            vertex, normal = depth.vertex, depth.normal
+            assert vertex is not None  # noqa: S101 - the loss came first
+            assert normal is not None  # noqa: S101
+            offset = depth.point - hands.vertices(vertex)
+            near = distance_curvature(offset, normal, depth.weight, config.depth_noise)
+            equations.add_points(rates.vertices(vertex), config.depth_weight * near)
+        return equations
+
+    def _optimizer(self, rate: float) -> Adam | DampedSteps:
+        if self.config.gauss_newton:
+            return DampedSteps(self.parameters, fits_scale=not self.metric)
         changed = dict(self.parameters)
         if self.metric:
             del changed["log_scale"]

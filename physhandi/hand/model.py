@@ -11,6 +11,10 @@ from physhandi.hand.names import HandKind, HandSide
 
 SHAPE_COUNT = 10
 JOINT_COUNT = 15
+PARENT_BONE = [0 if joint % 3 == 0 else joint for joint in range(JOINT_COUNT)]
+"""Bone that each joint hangs on: bone 0 is the palm, bone j + 1 the one that joint j moves."""
+KEYPOINT_BONE = [0, *(bone for j in range(1, 16, 3) for bone in (0, j, j + 1, j + 2))]
+"""Bone that carries each keypoint: a joint's rides on the bone before it, a tip's on the last."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,13 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose
+from physhandi.hand.model import (
+    JOINT_COUNT,
+    KEYPOINT_BONE,
+    PARENT_BONE,
+    HandModel,
+    HandPose,
+)
 from physhandi.hand.names import HandSide
 from physhandi.hand.rotation import rotation_offset
 from physhandi.hand.skinning import blend, place, turn_bones
@@ -153,14 +159,7 @@ _KEYPOINT_NODES = [
         for node in (*_JOINT_NODES[3 * finger : 3 * finger + 3], f"{_FINGERS[finger]}-tip")
     ),
 ]
-_PARENT = [0 if joint % 3 == 0 else joint for joint in range(JOINT_COUNT)]
-"""Bone that each joint hangs on."""
 _FINGER_OF_JOINT = [joint // 3 for joint in range(JOINT_COUNT)]
-_BONE_OF_KEYPOINT = [0, *(bone for j in range(1, 16, 3) for bone in (0, j, j + 1, j + 2))]
-"""Bone that carries each keypoint: a joint's rides on the bone before it, a tip's on the last.
-
-Bone 0 is the palm, bone j + 1 the one that joint j moves.
-"""
 
 
 @dataclass(frozen=True)
@@ -210,7 +209,7 @@ class OpenHand(HandModel):
         keypoint = [bone[name] for name in _KEYPOINT_NODES]
         node = mesh.T_mesh_bone[keypoint, :3, 3]
         self.keypoint_position = (node + KEYPOINT_OFFSET - origin) * mirror
-        self.keypoint_weight = np.eye(JOINT_COUNT + 1)[_BONE_OF_KEYPOINT]
+        self.keypoint_weight = np.eye(JOINT_COUNT + 1)[KEYPOINT_BONE]
         self.palm_axes = _palm_axes(self.joint_position)
         self._tensors: dict[torch.dtype, dict[str, Tensor]] = {}
 
@@ -313,7 +312,7 @@ class OpenHand(HandModel):
             joint = np.concatenate([np.zeros((1, 3)), self.joint_position])
             arrays = {
                 "bone": joint,
-                "offset": self.joint_position - joint[_PARENT],
+                "offset": self.joint_position - joint[PARENT_BONE],
                 "joint_axes": self.joint_axes,
                 "palm_axes": self.palm_axes,
                 "rate": np.array(SHAPE_RATE),

@@ -14,10 +14,7 @@ def rotation_offset(rotation_vector: Float[Tensor, "*batch 3"]) -> Float[Tensor,
     Returns:
         The rotation matrix less the identity.
     """
-    x, y, z = rotation_vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
-    cross = cross.reshape(*rotation_vector.shape[:-1], 3, 3)
+    cross = _cross_matrix(rotation_vector)
     squared = (rotation_vector**2).sum(-1)[..., None, None]
     is_small = squared < 1e-4
     angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
@@ -26,6 +23,33 @@ def rotation_offset(rotation_vector: Float[Tensor, "*batch 3"]) -> Float[Tensor,
         is_small, 0.5 - squared / 24 + squared**2 / 720, (1 - angle.cos()) / angle**2
     )
     return sine * cross + cosine * (cross @ cross)
+
+
+def _cross_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Compute the matrices that multiply another vector by the cross product."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    return cross.reshape(*vector.shape[:-1], 3, 3)
+
+
+def left_jacobian(rotation_vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Compute how a rotation turns on as its rotation vector changes.
+
+    Args:
+        rotation_vector: Axis times angle [rad].
+
+    Returns:
+        Column i is the rotation vector, per radian, of the turn that follows the rotation if
+        component i grows.
+    """
+    cross = _cross_matrix(rotation_vector)
+    squared = (rotation_vector**2).sum(-1)[..., None, None]
+    is_small = squared < 1e-4
+    angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
+    once = torch.where(is_small, 0.5 - squared / 24, (1 - angle.cos()) / angle**2)
+    twice = torch.where(is_small, 1 / 6 - squared / 120, (angle - angle.sin()) / angle**3)
+    return torch.eye(3).to(cross) + once * cross + twice * (cross @ cross)
 
 
 def rotation_matrix(rotation_vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

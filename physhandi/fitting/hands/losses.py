@@ -25,6 +25,8 @@ REFRESH = 10
 """Evaluations of the depth loss between two searches for corresponding vertices."""
 DEPTH_DOUBT = 3.0
 """Depth errors beyond this many standard deviations lose their pull (Cauchy's loss)."""
+_ASIDE = 0.1
+"""Share of a way along the surface, squared, that counts as distance from it."""
 _SKIN = 0.003
 """Least depth of a keypoint under the hand's surface [m]."""
 _EDGE = 0.03
@@ -57,12 +59,36 @@ def keypoint_costs(
         target: Observed keypoints.
         breadth: ``c``, in units of noise.
     """
-    projected = _projected(point, target.projection)
-    depth = projected[..., 2:]
-    nearest = 1e-3 * depth.detach().abs().median()
-    pixel = projected[..., :2] / depth.clamp(min=float(nearest) + 1e-9)
+    pixel, _ = _seen(point, target.projection)
     squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
     return target.weight * _cauchy(squared, breadth)
+
+
+def reprojection_curvature(
+    point: Float[Tensor, "frame 21 3"], target: KeypointTarget, breadth: float
+) -> Float[Tensor, "frame 21 3 3"]:
+    """Compute the curvature of `reprojection_loss` in the place of each keypoint.
+
+    As Gauss and Newton have it: where Cauchy's loss pulls less, it bends less.
+    """
+    pixel, depth = _seen(point, target.projection)
+    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
+    pull = target.weight * _cauchy_pull(squared, breadth) / target.noise[:, None, None] ** 2
+    row = target.projection[:, None, None, :, :3]
+    rate = (row[..., :2, :] - pixel[..., None] * row[..., 2:, :]) / depth[..., None]
+    weighted = 2.0 / point.shape[0] * pull[..., None, None] * rate
+    return torch.einsum("vfkai,vfkaj->fkij", weighted, rate)
+
+
+def _seen(
+    point: Float[Tensor, "frame point 3"], projection: Float[Tensor, "view 3 4"]
+) -> tuple[Float[Tensor, "view frame point 2"], Float[Tensor, "view frame point 1"]]:
+    """Project points of the world: pixels and depth, which is above zero."""
+    projected = _projected(point, projection)
+    depth = projected[..., 2:]
+    nearest = 1e-3 * depth.detach().abs().median()
+    depth = depth.clamp(min=float(nearest) + 1e-9)
+    return projected[..., :2] / depth, depth
 
 
 def _projected(
@@ -76,6 +102,11 @@ def _projected(
 def _cauchy(squared: Tensor, breadth: float) -> Tensor:
     """Let squared errors beyond a breadth lose their pull."""
     return breadth**2 * torch.log1p(squared / breadth**2)
+
+
+def _cauchy_pull(squared: Tensor, breadth: float) -> Tensor:
+    """Give the slope of `_cauchy`."""
+    return 1 / (1 + squared / breadth**2)
 
 
 def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> Float[Tensor, ""]:
@@ -92,6 +123,13 @@ def limit_costs(
     turned = articulation * mirror
     beyond = (limit[..., 0] - turned).relu() + (turned - limit[..., 1]).relu()
     return beyond**2
+
+
+def limit_curvature(
+    articulation: Float[Tensor, "frame 15 3"], model: HandModel
+) -> Float[Tensor, "frame 15 3"]:
+    """Compute the curvature of `limit_loss` in each number of the joints."""
+    return 2.0 / articulation.shape[0] * (limit_costs(articulation, model) > 0)
 
 
 def hand_acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
@@ -150,8 +188,7 @@ def distance_loss(
     Returns:
         Mean over points, then frames, in units of the noise, squared.
     """
-    costs = distance_costs(offset, normal, weight, noise)
-    return costs.sum() / max(int((weight.sum(1) > 0).sum()), 1)
+    return distance_costs(offset, normal, weight, noise).sum() / _measured_frames(weight)
 
 
 def distance_costs(
@@ -161,10 +198,34 @@ def distance_costs(
     noise: float,
 ) -> Float[Tensor, "frame point"]:
     """Measure each point's distance as `distance_loss` does, times its weight."""
+    return weight * _cauchy(_surface_distance(offset, normal) / noise**2, DEPTH_DOUBT)
+
+
+def distance_curvature(
+    offset: Float[Tensor, "frame point 3"],
+    normal: Float[Tensor, "frame point 3"],
+    weight: Float[Tensor, "frame point"],
+    noise: float,
+) -> Float[Tensor, "frame point 3 3"]:
+    """Compute the curvature of `distance_loss` in the place of each point, by Gauss and Newton."""
+    pull = weight * _cauchy_pull(_surface_distance(offset, normal) / noise**2, DEPTH_DOUBT)
+    across = (1 - _ASIDE) * normal[..., :, None] * normal[..., None, :]
+    pull = 2.0 / _measured_frames(weight) * pull / noise**2
+    return pull[..., None, None] * (across + _ASIDE * torch.eye(3))
+
+
+def _surface_distance(
+    offset: Float[Tensor, "frame point 3"], normal: Float[Tensor, "frame point 3"]
+) -> Float[Tensor, "frame point"]:
+    """Square distances from a surface; ways along it count for a part [m²]."""
     along = (offset * normal).sum(-1)
     aside = ((offset**2).sum(-1) - along**2).clamp(min=0)
-    squared = (along**2 + 0.1 * aside) / noise**2
-    return weight * _cauchy(squared, DEPTH_DOUBT)
+    return along**2 + _ASIDE * aside
+
+
+def _measured_frames(weight: Float[Tensor, "frame point"]) -> int:
+    """Count the frames in which a point was measured; 1 if there is none."""
+    return max(int((weight.sum(1) > 0).sum()), 1)
 
 
 def vertex_normals_torch(
@@ -212,6 +273,24 @@ def free_space_loss(
     Returns:
         Sum over keypoints and views, mean over frames, in units of the noise, squared.
     """
+    squared = _in_free_space(point, space) ** 2 / noise**2
+    return _cauchy(squared, DEPTH_DOUBT).sum() / point.shape[0]
+
+
+def free_space_curvature(
+    point: Float[Tensor, "frame 21 3"], space: FreeSpace, noise: float
+) -> Float[Tensor, "frame 21 3 3"]:
+    """Compute the curvature of `free_space_loss` in each keypoint's place, by Gauss and Newton."""
+    before = _in_free_space(point, space)
+    pull = (before > 0) * _cauchy_pull(before**2 / noise**2, DEPTH_DOUBT) / noise**2
+    sight = space.projection[:, 2, :3]
+    return 2.0 / point.shape[0] * torch.einsum("vfk,vi,vj->fkij", pull, sight, sight)
+
+
+def _in_free_space(
+    point: Float[Tensor, "frame 21 3"], space: FreeSpace
+) -> Float[Tensor, "view frame 21"]:
+    """Compute how far keypoints are before where they may be [m]."""
     projected = _projected(point, space.projection)
     depth = projected[..., 2]
     with torch.no_grad():
@@ -223,6 +302,4 @@ def free_space_loss(
         view, frame = (torch.arange(count) for count in space.depth.shape[:2])
         measured = space.depth[view[:, None, None], frame[None, :, None], row, column]
         is_known &= (measured > 0) & (measured - depth < _EDGE)
-    before = torch.where(is_known, measured + _SKIN - depth, 0.0).relu()
-    squared = before**2 / noise**2
-    return _cauchy(squared, DEPTH_DOUBT).sum() / point.shape[0]
+    return torch.where(is_known, measured + _SKIN - depth, 0.0).relu()

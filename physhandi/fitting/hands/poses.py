@@ -15,8 +15,8 @@ from physhandi.hand.rotation import quaternion_matrix
 
 _RATES = {"shape": 2.0, "articulation": 1.0, "rotation": 0.3, "translation": 0.1, "log_scale": 0.1}
 """Step size of each parameter, as a share of that of the joints."""
-_NARROWS = 0.6
-"""Share of the updates over which errors that far off still pull become fewer."""
+NARROWS = 0.6
+"""Share of the updates of a descent over which errors that far off still pull become fewer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +79,12 @@ def step_share(iteration: int, iterations: int) -> float:
     return 0.05 + 0.475 * (1 + math.cos(math.pi * iteration / iterations))
 
 
-def doubt_breadth(doubt: float, iteration: int, iterations: int) -> float:
-    """Tell from which keypoint error on the pull falls: ten times `doubt` first, then narrowing."""
-    return doubt * 10 ** (1 - min(iteration / (_NARROWS * iterations), 1.0))
+def doubt_breadth(doubt: float, iteration: int, narrowing: float) -> float:
+    """Tell from which keypoint error on the pull falls.
+
+    Args:
+        doubt: In the end, in units of the expected error; in the beginning ten times as much.
+        iteration: Updates that were made.
+        narrowing: Updates until the end.
+    """
+    return doubt * 10 ** (1 - min(iteration / narrowing, 1.0))

@@ -26,6 +26,7 @@ from physhandi.fitting.hands.losses import (
 )
 from physhandi.fitting.hands.observed import DepthTarget, KeypointTarget
 from physhandi.fitting.hands.poses import (
+    NARROWS,
     PosedHands,
     doubt_breadth,
     hand_optimizer,
@@ -155,7 +156,7 @@ class _Starts:
         if iteration % REFRESH == 0:
             self._look()
         self._optimizer.zero_grad()
-        cost = self._costs(doubt_breadth(config.doubt, iteration, iterations))
+        cost = self._costs(doubt_breadth(config.doubt, iteration, NARROWS * iterations))
         shape = self.parameters["shape"]
         loss = cost.sum() / self._frame_count + config.shape_weight * (shape**2).sum()
         loss.backward()

@@ -236,13 +236,14 @@ def ways_to_depth(
             continue
         ray = target.towards_camera[hand, :count].numpy().astype(np.float64)
         point = target.point[hand, :count].numpy().astype(np.float64)
-        offset = point[:, None] - vertex[hand].astype(np.float64)
-        along = (offset * ray[:, None]).sum(axis=2)
-        aside = np.linalg.norm(offset - along[..., None] * ray[:, None], axis=2)
+        place = vertex[hand].astype(np.float64)
+        along = (point * ray).sum(axis=1)[:, None] - ray @ place.T
+        squared = (point**2).sum(axis=1)[:, None] - 2 * point @ place.T + (place**2).sum(axis=1)
+        aside = squared - along**2
         aside[ray @ normal[hand].T <= 0.0] = np.inf
         nearest = aside.argmin(axis=1)
         rows = np.arange(count)
-        is_hit = aside[rows, nearest] < _BESIDE
+        is_hit = aside[rows, nearest] < _BESIDE**2
         if is_hit.sum() < _LEAST_POINTS:
             continue
         direction = ray[is_hit].mean(axis=0)
