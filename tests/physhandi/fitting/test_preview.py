@@ -135,9 +135,9 @@ def test_stage_one_shows_joints_where_the_hand_is(tmp_path: Path) -> None:
     cameras = [looking_at_hand(azimuth) for azimuth in (0.0, 1.5)]
     sequence = write_scene(tmp_path / "a", [truth], cameras, seen_keypoints([truth], cameras))
     progress = Watching()
-    fit = reconstruct_hands(sequence, HandFitConfig(iterations=60), progress)
+    fit = reconstruct_hands(sequence, HandFitConfig(), progress)
     shown = progress.shown[-1].points["joints"]
-    assert len(progress.shown) == 6
+    assert len(progress.shown) == len(fit.curve) > 5
     assert shown.shape == (5, 21, 3)
     fitted = fit.motions[0].keypoints(load_hand_model("right"))
     assert np.linalg.norm(shown - fitted, axis=-1).max() < 0.003
