@@ -1,13 +1,17 @@
 """Previews of the simulated object during a fit."""
 
+import logging
 import math
 from collections.abc import Callable
 
 from jaxtyping import Float
 from torch import Tensor, where
 
+from physhandi.errors import SimulationDivergedError
 from physhandi.fitting.object_problem import ObjectProblem
 from physhandi.progress import Preview, Progress
+
+logger = logging.getLogger(__name__)
 
 
 class RolloutPreview:
@@ -49,9 +53,18 @@ class RolloutPreview:
         loss: float,
         simulate: Callable[[], Float[Tensor, "frame node 3"]],
     ) -> None:
-        """Simulate a motion for the preview alone and show it with its loss [m²], if one is due."""
-        if self._progress.wants_preview():
-            self._progress.preview(lambda: self._preview(problem, loss, simulate()))
+        """Simulate a motion for the preview alone and show it with its loss [m²], if one is due.
+
+        One that diverges is not shown: what holds in a batch of candidates may not do so alone.
+        """
+        if not self._progress.wants_preview():
+            return
+        try:
+            node = simulate()
+        except SimulationDivergedError as error:
+            logger.warning("%s: there is no preview. %s", self._stage, error)
+            return
+        self._progress.preview(lambda: self._preview(problem, loss, node))
 
     def _preview(
         self,

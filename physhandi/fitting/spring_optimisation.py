@@ -94,7 +94,7 @@ class FirstOrderResult:
         """What a stage tells of it besides its losses; empty if that is nothing."""
         began = (
             f"Began from candidate {self.start + 1} of the search: what became of those before was "
-            "unsteady."
+            "unsteady, or failed."
         )
         return " ".join(filter(None, (began if self.start else "", self.stopped)))
 
@@ -127,14 +127,17 @@ def fit_steady_springs(
         checkpointer: Keeps the state after an iteration; None keeps nothing.
 
     Returns:
-        The first steady result; if there is none, that with the least loss.
+        The first steady result; if there is none, that with the least loss of those that do not
+        diverge with a little more or less stiffness, or of all.
 
     Raises:
-        FitError: As `optimise_springs` does with the first start.
+        FitError: As `optimise_springs` does with the first start, if it does with all.
     """
     results: list[FirstOrderResult] = []
+    failures: list[FitError] = []
+    why = ""
     for number, start in enumerate(starts[: config.first_order.most_starts]):
-        listener = _LaterStart(progress, number, results[-1].sway) if results else progress
+        listener = _LaterStart(progress, number, why) if number else progress
         try:
             result = optimise_springs(
                 problems,
@@ -146,15 +149,18 @@ def fit_steady_springs(
                 loop=f"{SPRING_STAGE}_{number}" if number else SPRING_STAGE,
             )
         except FitError as error:
-            if not results:
-                raise
             logger.warning("%s: start %d fails. %s", SPRING_STAGE, number + 1, error)
+            failures.append(error)
+            why = f"{error}"
             continue
         sway = motion_sway(problems, result, device)
         results.append(replace(result, sway=sway, start=number))
         if results[-1].is_steady:
             return results[-1]
-    return min(results, key=lambda each: each.loss_after)
+        why = unsteadiness(NUDGE, sway, STEADY)
+    if not results:
+        raise failures[0]
+    return min(results, key=lambda each: (math.isinf(each.sway), each.loss_after))
 
 
 def motion_sway(problems: Many[ObjectProblem], result: FirstOrderResult, device: str) -> float:
@@ -206,13 +212,10 @@ def unsteadiness(nudge: float, sway: float, limit: float) -> str:
 class _LaterStart(RelayedProgress):
     """Hears of a descent that begins after others, whose iterations count before its own."""
 
-    def __init__(self, progress: Progress, number: int, sway: float) -> None:
+    def __init__(self, progress: Progress, number: int, why: str) -> None:
         super().__init__(progress)
         self._number = number
-        self._note = (
-            f"{unsteadiness(NUDGE, sway, STEADY)} Springs are fitted from another candidate of the "
-            "search."
-        )
+        self._note = f"{why} Springs are fitted from another candidate of the search."
 
     def report(
         self,

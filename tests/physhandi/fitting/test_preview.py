@@ -10,6 +10,8 @@ from support.physics.hand_scene import grasping, looking_at_hand, seen_keypoints
 from support.physics.refinement_world import held_patch, moved
 
 from physhandi.data.observation import ObjectObservation
+from physhandi.errors import SimulationDivergedError
+from physhandi.fitting import object_reconstruction
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
 from physhandi.fitting.hand_reconstruction import HandFitConfig, reconstruct_hands
 from physhandi.fitting.hand_refinement import RefinementConfig, refine_hands
@@ -17,7 +19,7 @@ from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.hand.loading import load_hand_model
-from physhandi.progress import Preview, Progress
+from physhandi.progress import NullProgress, Preview, Progress
 from physhandi.simulation.parameters import SimulationParameters
 
 PARAMETERS = SimulationParameters(
@@ -101,6 +103,24 @@ def test_the_search_shows_its_best_candidates_as_they_moved() -> None:
     assert first["object"].shape == (FRAMES, 16, 3)
     np.testing.assert_array_equal(first["control"], problem.control)
     assert np.nanmax(first["seen"][3, :, 2]) == pytest.approx(0.06, abs=1e-6)
+
+
+def test_a_candidate_that_diverges_when_it_is_simulated_to_be_shown_stops_no_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # As of one that holds in a batch, whose sums are rounded otherwise, and not alone.
+    problem, watching, calls = lifted_sheet(), Watching(), []
+
+    def diverges(*arguments: object) -> object:
+        calls.append(arguments)
+        raise SimulationDivergedError("Too fast.", frame=18, substep=4, node=562)
+
+    expected = search_object([problem], PARAMETERS, settings(), NullProgress())
+    monkeypatch.setattr(object_reconstruction, "simulate_problem", diverges)
+    result = search_object([problem], PARAMETERS, settings(), watching)
+    assert result.parameters == expected.parameters
+    assert len(calls) >= 2
+    assert watching.shown == []
 
 
 def test_every_iteration_can_be_shown_and_none_is_made_for_nobody() -> None:
