@@ -7,6 +7,7 @@ pair of frames to pair of frames. A dozen of such steps do what gradient descent
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -16,7 +17,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from physhandi.fitting.hands.poses import PosedHands
-from physhandi.hand.model import JOINT_COUNT, KEYPOINT_BONE, PARENT_BONE, SHAPE_COUNT
+from physhandi.hand.model import (
+    JOINT_COUNT,
+    KEYPOINT_BONE,
+    PARENT_BONE,
+    SHAPE_COUNT,
+    HandModel,
+)
 from physhandi.hand.rotation import left_jacobian, rotation_offset
 from physhandi.hand.skinning import turn_bones
 
@@ -52,11 +59,43 @@ class PointRates:
     """With the shape before it is bounded."""
 
 
+@dataclass(frozen=True, eq=False)
+class _RestRates:
+    """How points of a hand that is not posed move with its bounded shape, at the template's."""
+
+    keypoint: Float[Tensor, "21 3 10"]
+    vertex: Float[Tensor, "vertex 3 10"]
+    bone: Float[Tensor, "16 3 10"]
+    """Where each bone begins."""
+
+
+@lru_cache(maxsize=4)
+@torch.no_grad()
+def _rest_rates(model: HandModel) -> _RestRates:
+    """Compute the rates of a model by finite differences in double precision.
+
+    Those of other shapes differ by a tenth, which bends a step and not where it ends.
+    """
+
+    def points(shape: Float[Tensor, " 10"]) -> tuple[Tensor, Tensor, Tensor]:
+        still = shape.new_zeros(1, 3)
+        pose = model(shape, shape.new_zeros(1, JOINT_COUNT, 3), still, still)
+        return pose.keypoint[0], pose.vertex[0], model.bone_origins(shape)
+
+    template = points(torch.zeros(SHAPE_COUNT, dtype=torch.float64))
+    moved = [points(_DIFFERENCE * unit) for unit in torch.eye(SHAPE_COUNT, dtype=torch.float64)]
+    rates = (
+        (torch.stack(part, -1) - still[..., None]) / _DIFFERENCE
+        for part, still in zip(zip(*moved, strict=True), template, strict=True)
+    )
+    return _RestRates(*(rate.float() for rate in rates))
+
+
 class PoseRates:
     """How points of hands move with their poses and shape, to first order.
 
-    That is exact for keypoints of the open hand; where several bones hold a vertex, or a model
-    bulges with its pose, it is off by some hundredths.
+    With poses that is exact for keypoints of the open hand; where several bones hold a vertex, or a
+    model bulges with its pose, it is off by some hundredths.
     """
 
     @torch.no_grad()
@@ -66,9 +105,9 @@ class PoseRates:
         Args:
             hands: The hands; their parameters do not change while this is used.
         """
-        self._hands = hands
+        self._hands, self._rest = hands, _rest_rates(hands.model)
         articulation, shape = hands.parameters["articulation"], hands.shape()
-        joint, joint_rate = self._at_rest(hands.model.bone_origins)
+        joint, joint_rate = hands.model.bone_origins(shape), self._rest.bone
         axes = torch.as_tensor(hands.model.joint_axes).to(shape)
         turn = axes @ rotation_offset(articulation) @ axes.transpose(-1, -2)
         offset, moved = turn_bones(turn, joint)
@@ -85,24 +124,13 @@ class PoseRates:
     def keypoints(self) -> PointRates:
         """Compute how the keypoints move."""
         weight = torch.eye(JOINT_COUNT + 1)[KEYPOINT_BONE]
-        _, rate = self._at_rest(lambda shape: self._hands.model.keypoints(*_unposed(shape))[0])
-        return self._rates(self._hands.keypoints(), weight, rate)
+        return self._rates(self._hands.keypoints(), weight, self._rest.keypoint)
 
     @torch.no_grad()
     def vertices(self, index: Int[Tensor, "frame point"]) -> PointRates:
         """Compute how some vertices of each frame's surface move."""
         weight = torch.as_tensor(self._hands.model.weight, dtype=torch.float32)
-        _, rate = self._at_rest(lambda shape: self._hands.model(*_unposed(shape)).vertex[0])
-        return self._rates(self._hands.vertices(index), weight[index], rate[index])
-
-    def _at_rest(
-        self, points: Callable[[Tensor], Tensor]
-    ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3 10"]]:
-        """Compute points of the unposed hand, and how they move with the bounded shape."""
-        shape = self._hands.shape().double()
-        still = points(shape)
-        moved = [points(shape + _DIFFERENCE * unit) for unit in torch.eye(SHAPE_COUNT).double()]
-        return still.float(), ((torch.stack(moved, -1) - still[..., None]) / _DIFFERENCE).float()
+        return self._rates(self._hands.vertices(index), weight[index], self._rest.vertex[index])
 
     def _rates(
         self,
@@ -135,12 +163,6 @@ class PoseRates:
             torch.cat([turned.movedim(2, 3).flatten(3), turned_wrist, identity], -1).flatten(1, 2),
             (wrist @ change * bound).flatten(1, 2),
         )
-
-
-def _unposed(shape: Float[Tensor, " 10"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Give what a model is called with for one hand that is not posed."""
-    still = shape.new_zeros(1, 3)
-    return shape, shape.new_zeros(1, JOINT_COUNT, 3), still, still
 
 
 class NormalEquations:

@@ -150,11 +150,10 @@ def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_on
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() > 0.05
     for is_new in (True, False):
         config = HandFitConfig(
-            iterations=60,
-            depth_iterations=60,
+            iterations=20,
+            depth_iterations=20,
             search_iterations=20,
             starts_at_depth=is_new,
-            fixed_normals=is_new,
         )
         assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.007
 
@@ -357,12 +356,12 @@ def test_of_two_hands_the_first_is_not_fitted_again(
     sequence = scene.write_scene(tmp_path / "a", motions, CAMERAS, keypoint)
 
     def fit(progress: Progress, checkpointer: Checkpointer | None) -> HandFit:
-        config = HandFitConfig(iterations=20, depth_iterations=0)
+        config = HandFitConfig(iterations=6, depth_iterations=0)
         return reconstruct_hands(sequence, config, progress, checkpointer=checkpointer)
 
     reports = check_resumed(fit, tmp_path / "ckpt", (3,))
     told = [report[1] for report in reports]
     # The first goes on after its third step, to its last one; then the second begins.
     assert told[:2] == [3, 4]
-    assert told.count(20) == 2
-    assert told[told.index(20) + 1] == 1
+    assert told.count(6) == 2
+    assert told[told.index(6) + 1] == 1
