@@ -333,37 +333,46 @@ class HandProblem:
         if resumed is not None:
             curve = [(int(iteration), loss) for iteration, loss in resumed.tensors["curve"]]
             self._restore_depth(resumed.tensors)
-            note = f"{self.model.side.capitalize()} hand. {resumed_note(resumed.iteration)}"
-            progress.report(HAND_STAGE, resumed.iteration, total, None, note)
+            made = curve[-1][0] if config.gauss_newton else resumed.iteration
+            note = f"{self.model.side.capitalize()} hand. {resumed_note(made)}"
+            progress.report(HAND_STAGE, made, made + total - resumed.iteration, None, note)
 
         def step(iteration: int, loss: Tensor, optimizer: Adam | DampedSteps | None) -> None:
             progress.check_cancelled()
-            is_told = iteration % 10 == 0 or iteration == total
-            is_told, value = is_told or isinstance(optimizer, DampedSteps), float(loss.detach())
+            is_told, made = iteration % 10 == 0 or iteration == total, iteration
+            if isinstance(optimizer, DampedSteps):
+                # Its last step has the number of the last that there may be: some are left out.
+                is_told, made = True, curve[-1][0] + 1 if curve else 1
+            value = float(loss.detach())
             if is_told:
-                curve.append((iteration, value))
+                curve.append((made, value))
             if optimizer is not None:  # A search is short: it begins again.
                 checkpointer.offer(loop, iteration, lambda: state(optimizer))
             if is_told:
                 message = f"{self.model.side.capitalize()} hand"
-                progress.report(HAND_STAGE, iteration, total, value, message)
+                progress.report(HAND_STAGE, made, made + total - iteration, value, message)
                 self._show(value, progress)
 
         with one_thread():
             if self._searched is not None and resumed is None:
                 self._search(self._searched, step)
             self._fit(step, resumed)
-        with torch.no_grad():
-            after = float(self.loss(config.doubt))
+        motion, after = self._outcome()
+        return SolvedHand(motion, before, after, curve)
+
+    @torch.no_grad()
+    def _outcome(self) -> tuple[HandMotion, float]:
+        """Smooth the motion, if that is wanted, and give it with its loss."""
+        after = float(self.loss(self.config.doubt))
         if not math.isfinite(after):
             raise FitError(
                 f"The fit of the {self.model.side} hand did not stay finite (loss {after})."
             )
-        if config.smooths_motion:
-            with torch.no_grad(), one_thread():
+        if self.config.smooths_motion:
+            with one_thread():
                 self._smooth()
-                after = float(self.loss(config.doubt))
-        return SolvedHand(self._motion(), before, after, curve)
+                after = float(self.loss(self.config.doubt))
+        return self._motion(), after
 
     def _first_iterations(self) -> int:
         """Tell how many updates are made at most before those on keypoints and depth."""

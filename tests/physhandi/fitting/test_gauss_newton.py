@@ -25,6 +25,7 @@ from physhandi.fitting.hands.poses import PosedHands
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.names import HandSide
 from physhandi.hand.rotation import left_jacobian, rotation_matrix
+from physhandi.progress import NullProgress
 
 SHARED = 11
 
@@ -314,8 +315,23 @@ def test_a_dozen_steps_come_nearer_than_hundreds_of_updates_of_gradient_descent(
     keypoint = scene.seen_keypoints([truth], cameras)
     keypoint[..., :2] += np.random.default_rng(3).normal(size=keypoint[..., :2].shape)
     sequence = scene.write_scene(tmp_path / "a", [truth], cameras, keypoint, metric=metric)
-    steps = reconstruct_hands(sequence, HandFitConfig())
+    told: list[tuple[int, int]] = []
+
+    class Heard(NullProgress):
+        def report(
+            self,
+            stage: str,
+            iteration: int,
+            total: int,
+            loss: float | None = None,
+            message: str = "",
+        ) -> None:
+            told.append((iteration, total))
+
+    steps = reconstruct_hands(sequence, HandFitConfig(), Heard())
+    # Steps are counted as they are made, and in the end there are no more.
+    count = len(steps.curve)
+    assert told == [*((number, 40) for number in range(1, count)), (count, count)]
     descent = reconstruct_hands(sequence, HandFitConfig(gauss_newton=False, iterations=300))
     assert steps.loss_after < descent.loss_after
-    assert len(steps.curve) < 30
-    assert steps.curve[-1][0] == 40
+    assert steps.curve[-1][0] == len(steps.curve) < 30

@@ -68,9 +68,7 @@ def test_a_known_hand_is_found_again_and_frames_that_no_view_saw_are_bridged(
     assert score.fitted.median < 0.5
     assert score.frame_count == 12
     assert fit.loss_before > 10 * fit.loss_after
-    # Its last step has the number of the most that there may be.
-    assert fit.curve[-1][0] == 40
-    assert len(fit.curve) < 40
+    assert 10 < fit.curve[-1][0] == len(fit.curve) < 40
     np.testing.assert_allclose(fit.keypoint, keypoint)
     assert np.abs(np.diff(fit.motions[0].wrist_rotation, axis=0)).max() < 0.3
 
