@@ -10,6 +10,7 @@ keypoints.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
@@ -201,20 +202,6 @@ class SolvedHand:
     curve: list[tuple[int, float]]
 
 
-@dataclass(frozen=True, eq=False)
-class _Descent:
-    """Updates of one loss."""
-
-    iterations: int
-    """Most of them."""
-    rate: float
-    """First step size of the joints in gradient descent [rad]."""
-    breadth: Callable[[int], float]
-    """From which keypoint error on the pull falls, in units of noise, by the number of updates."""
-    depth: DepthTarget | None
-    """Measured points; None if keypoints alone are fitted."""
-
-
 class HandProblem:
     """The fit of one hand: observations, parameters, loss and optimizer."""
 
@@ -396,24 +383,15 @@ class HandProblem:
 
     def _fit(self, step: _Step, resumed: SavedState | None) -> None:
         """Descend on keypoints and place the hand by depth, or search; then descend on both."""
-        config, depth, first = self.config, self.depth, self._first_iterations()
-        narrowing = NARROWS * config.iterations
-        if config.gauss_newton:
-            narrowing = min(narrowing, _NARROWING_STEPS)
-
-        def breadth(iteration: int) -> float:
-            return doubt_breadth(config.doubt, iteration, narrowing)
-
-        if self._searched is None and (resumed is None or resumed.iteration <= first):
-            descent = _Descent(first, config.learning_rate, breadth, None)
-            self._descend(descent, step, first=0, resumed=resumed)
+        depth = self.depth
+        keypoints_first = self._searched is None
+        if keypoints_first and (resumed is None or resumed.iteration <= self._first_iterations()):
+            self._descend(None, step, resumed)
             resumed = None
             if depth is not None:
                 self._place_by_depth(depth)
         if depth is not None:
-            count, rate = self._depth_iterations(), config.depth_learning_rate
-            descent = _Descent(count, rate, lambda _: config.doubt, depth)
-            self._descend(descent, step, first=first, resumed=resumed)
+            self._descend(depth, step, resumed)
 
     def _smooth(self) -> None:
         """Smooth the motion as far as the keypoints allow."""
@@ -456,51 +434,59 @@ class HandProblem:
                 )
             )
 
-    def _descend(
-        self, descent: _Descent, step: _Step, *, first: int, resumed: SavedState | None
-    ) -> None:
-        """Make updates, the first of which has the number after `first`."""
-        optimizer, begin = self._optimizer(descent.rate), 0
+    def _descend(self, depth: DepthTarget | None, step: _Step, resumed: SavedState | None) -> None:
+        """Make updates on keypoints or, with measured points, on both."""
+        config = self.config
+        first, count, rate = 0, self._first_iterations(), config.learning_rate
+        if depth is not None:
+            first, count, rate = count, self._depth_iterations(), config.depth_learning_rate
+        optimizer, begin = self._optimizer(rate), 0
         if resumed is not None:
             optimizer.restore(resumed.tensors)
             begin = resumed.iteration - first
-        for iteration in range(begin, descent.iterations):
+        for iteration in range(begin, count):
             number = first + iteration + 1
-            breadth = descent.breadth(iteration)
-
-            def loss(breadth: float = breadth) -> Tensor:
-                depth = descent.depth
-                return self.loss(breadth) if depth is None else self.loss_with_depth(depth)
-
+            breadth = config.doubt if depth is not None else self._breadth(iteration)
+            loss = partial(self._loss_at, breadth, depth)
             if isinstance(optimizer, Adam):
                 optimizer.zero_grad()
                 value = loss()
                 value.backward()
-                optimizer.step(step_share(iteration, descent.iterations))
+                optimizer.step(step_share(iteration, count))
                 step(number, value, optimizer)
                 continue
-            if descent.depth is not None:
-                self._look(descent.depth)
-            value = optimizer.update(loss, lambda at=breadth: self._curvature(at, descent.depth))
-            is_last = breadth <= self.config.doubt and optimizer.changes_nothing
-            step(first + descent.iterations if is_last else number, value, optimizer)
+            if depth is not None:
+                self._look(depth)
+            value = optimizer.update(loss, partial(self._curvature, breadth, depth))
+            is_last = breadth <= config.doubt and optimizer.changes_nothing
+            step(first + count if is_last else number, value, optimizer)
             if is_last:
                 break
+
+    def _breadth(self, iteration: int) -> float:
+        """Tell from which keypoint error on the pull falls in an update on keypoints alone."""
+        narrowing = NARROWS * self.config.iterations
+        if self.config.gauss_newton:
+            narrowing = min(narrowing, _NARROWING_STEPS)
+        return doubt_breadth(self.config.doubt, iteration, narrowing)
+
+    def _loss_at(self, breadth: float, depth: DepthTarget | None) -> Tensor:
+        return self.loss(breadth) if depth is None else self.loss_with_depth(depth)
 
     @torch.no_grad()
     def _curvature(self, breadth: float, depth: DepthTarget | None) -> NormalEquations:
         """Compute the curvature of the loss, or of the loss with depth."""
         config, parameters, hands = self.config, self.parameters, self._hands
         articulation, count = parameters["articulation"], len(parameters["articulation"])
-        rates, point = PoseRates(hands), hands.keypoints()
-        scale = parameters["log_scale"].exp()
+        rates, scale = PoseRates(hands), parameters["log_scale"].exp()
         equations = NormalEquations(count, fits_scale=not self.metric)
         by_keypoint = rates.keypoints()
+        point = by_keypoint.point
         seen = scale**2 * reprojection_curvature(point * scale, self.target, breadth)
         if depth is not None and self.space is not None:
             free = free_space_curvature(point, self.space, config.depth_noise)
             seen = seen + config.free_space_weight * free
-        equations.add_points(by_keypoint, seen, point)
+        equations.add_points(by_keypoint, seen, is_scaled=True)
         reach = config.acceleration_noise / self.frame_rate**2
         equations.add_accelerations(by_keypoint, 1 / reach**2 / count)
         bent = config.limit_weight * limit_curvature(articulation, self.model)
@@ -511,9 +497,10 @@ class HandProblem:
             vertex, normal = depth.vertex, depth.normal
             assert vertex is not None  # noqa: S101 - the loss came first
             assert normal is not None  # noqa: S101
-            offset = depth.point - hands.vertices(vertex)
+            by_vertex = rates.vertices(vertex)
+            offset = depth.point - by_vertex.point
             near = distance_curvature(offset, normal, depth.weight, config.depth_noise)
-            equations.add_points(rates.vertices(vertex), config.depth_weight * near)
+            equations.add_points(by_vertex, config.depth_weight * near)
         return equations
 
     def _optimizer(self, rate: float) -> Adam | DampedSteps:

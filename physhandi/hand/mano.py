@@ -21,8 +21,7 @@ from physhandi.errors import MissingInputError
 from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose
 from physhandi.hand.names import HandSide
 from physhandi.hand.open_hand import OpenHand
-from physhandi.hand.rotation import rotation_offset
-from physhandi.hand.skinning import blend, place, turn_bones
+from physhandi.hand.skinning import blend, joint_turns, place, turn_bones
 
 FOLDER_VARIABLE = "PHYSHANDI_HANDS"
 MANO_JOINT = (13, 14, 15, 1, 2, 3, 4, 5, 6, 10, 11, 12, 7, 8, 9)
@@ -194,7 +193,7 @@ class ManoHand(HandModel):
         self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
     ) -> _Bones:
         axes = self._constants(articulation)["joint_axes"]
-        turn = axes @ rotation_offset(articulation) @ axes.transpose(-1, -2)
+        turn = joint_turns(articulation, axes)
         joint = self.bone_origins(shape)
         return _Bones(joint, turn, *turn_bones(turn, joint))
 

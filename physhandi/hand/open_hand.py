@@ -21,8 +21,7 @@ from physhandi.hand.model import (
     HandPose,
 )
 from physhandi.hand.names import HandSide
-from physhandi.hand.rotation import rotation_offset
-from physhandi.hand.skinning import blend, place, turn_bones
+from physhandi.hand.skinning import blend, joint_turns, place, turn_bones
 
 _MAGIC = b"glTF"
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
@@ -292,8 +291,7 @@ class OpenHand(HandModel):
     ) -> tuple[Tensor, Tensor]:
         """Compute each bone's rotation, less the identity, and how far its origin moved."""
         axes = self._constants(articulation)["joint_axes"]
-        turn = axes @ rotation_offset(articulation) @ axes.transpose(-1, -2)
-        return turn_bones(turn, skeleton.joint)
+        return turn_bones(joint_turns(articulation, axes), skeleton.joint)
 
     def _skin(
         self, part: str, skeleton: _Skeleton, rotation: Tensor, moved: Tensor

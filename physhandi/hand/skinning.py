@@ -7,6 +7,18 @@ from torch import Tensor
 from physhandi.hand.rotation import rotation_offset
 
 
+def joint_turns(
+    articulation: Float[Tensor, "batch 15 3"], axes: Float[Tensor, "15 3 3"]
+) -> Float[Tensor, "batch 15 3 3"]:
+    """Compute the rotation of each joint in the hand's frame, less the identity.
+
+    Args:
+        articulation: Rotation vector of every joint in its bone's own frame [rad].
+        axes: Axes of that frame, as columns.
+    """
+    return axes @ rotation_offset(articulation) @ axes.transpose(-1, -2)
+
+
 def turn_bones(
     turn: Float[Tensor, "batch 15 3 3"], joint: Float[Tensor, "16 3"]
 ) -> tuple[Float[Tensor, "batch 16 3 3"], Float[Tensor, "batch 16 3"]]:

@@ -24,8 +24,8 @@ from physhandi.hand.model import (
     SHAPE_COUNT,
     HandModel,
 )
-from physhandi.hand.rotation import left_jacobian, rotation_offset
-from physhandi.hand.skinning import turn_bones
+from physhandi.hand.rotation import left_jacobian
+from physhandi.hand.skinning import joint_turns, turn_bones
 
 _ANGLE_COUNT = 3 * JOINT_COUNT
 POSE_COUNT = _ANGLE_COUNT + 6
@@ -33,6 +33,8 @@ POSE_COUNT = _ANGLE_COUNT + 6
 of a turn about the wrist in the world's frame, then the way of the wrist."""
 _REACH = 2
 """Frames over which priors tie one to another."""
+_SECOND = (1.0, -2.0, 1.0)
+"""Factors of a second difference."""
 _DIFFERENCE = 1e-5
 """Step of a shape's component from which the rates of the unposed hand are computed."""
 _FLOOR = 1e-9
@@ -53,6 +55,8 @@ _PATIENCE = 4
 class PointRates:
     """How points of posed hands move: three rows for each point, x, y and z [m]."""
 
+    point: Float[Tensor, "frame point 3"]
+    """Where they are [m]."""
     pose: Float[Tensor, "frame row pose"]
     """With the pose of their frame."""
     shape: Float[Tensor, "frame row 10"]
@@ -109,8 +113,7 @@ class PoseRates:
         articulation, shape = hands.parameters["articulation"], hands.shape()
         joint, joint_rate = hands.model.bone_origins(shape), self._rest.bone
         axes = torch.as_tensor(hands.model.joint_axes).to(shape)
-        turn = axes @ rotation_offset(articulation) @ axes.transpose(-1, -2)
-        offset, moved = turn_bones(turn, joint)
+        offset, moved = turn_bones(joint_turns(articulation, axes), joint)
         self._bone = offset + torch.eye(3)
         self._origin = (joint + moved)[:, 1:]
         self._axis = self._bone[:, PARENT_BONE] @ axes @ left_jacobian(articulation)
@@ -160,6 +163,7 @@ class PoseRates:
         )
         bound = 1 - (self._hands.shape() / 3) ** 2
         return PointRates(
+            point,
             torch.cat([turned.movedim(2, 3).flatten(3), turned_wrist, identity], -1).flatten(1, 2),
             (wrist @ change * bound).flatten(1, 2),
         )
@@ -184,17 +188,18 @@ class NormalEquations:
         self,
         rates: PointRates,
         curvature: Float[Tensor, "frame point 3 3"],
-        scaled: Float[Tensor, "frame point 3"] | None = None,
+        *,
+        is_scaled: bool = False,
     ) -> None:
         """Add a term of points, each by itself.
 
         Args:
             rates: How the points move.
             curvature: Second derivatives of the term in the place of each point [1/m²].
-            scaled: Where the points are, if the term sees them scaled and the scale is fitted: so
-                they move with the logarithm of the scale.
+            is_scaled: Whether the term sees the points scaled: if the scale is fitted, they move
+                with its logarithm.
         """
-        shared = self._shared_rates(rates, scaled)
+        shared = self._shared_rates(rates, is_scaled=is_scaled)
         bent_pose, bent_shared = (
             (curvature @ rate.unflatten(1, (-1, 3))).flatten(1, 2) for rate in (rates.pose, shared)
         )
@@ -213,15 +218,19 @@ class NormalEquations:
         frame_count = len(rates.pose)
         if frame_count <= _REACH:
             return
-        difference = torch.from_numpy(np.diff(np.eye(frame_count), _REACH, axis=0)).float()
-        tie = 2 * weight * difference.T @ difference
-        shared = self._shared_rates(rates, None)
-        bent = (tie @ shared.flatten(1)).view_as(shared)
+        shared = self._shared_rates(rates, is_scaled=False)
+        # The transpose of a second difference is that of what zeros surround.
+        around = torch.zeros_like(shared[:_REACH])
+        second = torch.cat([around, torch.diff(shared, _REACH, dim=0), around])
+        bent = 2 * weight * torch.diff(second, _REACH, dim=0)
         self._mixed += rates.pose.transpose(1, 2) @ bent
         self._shared += (shared.transpose(1, 2) @ bent).sum(0)
         for after in range(_REACH + 1):
             first, second = rates.pose[: frame_count - after], rates.pose[after:]
-            block = tie.diagonal(after)[:, None, None] * (first.transpose(1, 2) @ second)
+            tie = torch.zeros(frame_count - after)
+            for at in range(_REACH + 1 - after):
+                tie[at : at + frame_count - _REACH] += _SECOND[at] * _SECOND[at + after]
+            block = 2 * weight * tie[:, None, None] * (first.transpose(1, 2) @ second)
             self._pose[after, : frame_count - after] += block
 
     def add_angles(self, curvature: Float[Tensor, "frame 15 3"], tie: float) -> None:
@@ -276,14 +285,12 @@ class NormalEquations:
         return (alone - coupled @ shared_step).float(), shared_step.float()
 
     def _shared_rates(
-        self, rates: PointRates, scaled: Float[Tensor, "frame point 3"] | None
+        self, rates: PointRates, *, is_scaled: bool
     ) -> Float[Tensor, "frame row shared"]:
         if len(self._shared) == SHAPE_COUNT:
             return rates.shape
-        grown = torch.zeros_like(rates.shape[..., :1])
-        return torch.cat(
-            [rates.shape, grown if scaled is None else scaled.flatten(1)[..., None]], -1
-        )
+        grown = rates.point if is_scaled else torch.zeros_like(rates.point)
+        return torch.cat([rates.shape, grown.flatten(1)[..., None]], -1)
 
 
 def _solve_blocks(

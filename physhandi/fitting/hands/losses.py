@@ -59,8 +59,7 @@ def keypoint_costs(
         target: Observed keypoints.
         breadth: ``c``, in units of noise.
     """
-    pixel, _ = _seen(point, target.projection)
-    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
+    _, _, squared = _seen(point, target)
     return target.weight * _cauchy(squared, breadth)
 
 
@@ -71,8 +70,7 @@ def reprojection_curvature(
 
     As Gauss and Newton have it: where Cauchy's loss pulls less, it bends less.
     """
-    pixel, depth = _seen(point, target.projection)
-    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
+    pixel, depth, squared = _seen(point, target)
     pull = target.weight * _cauchy_pull(squared, breadth) / target.noise[:, None, None] ** 2
     row = target.projection[:, None, None, :, :3]
     rate = (row[..., :2, :] - pixel[..., None] * row[..., 2:, :]) / depth[..., None]
@@ -81,14 +79,20 @@ def reprojection_curvature(
 
 
 def _seen(
-    point: Float[Tensor, "frame point 3"], projection: Float[Tensor, "view 3 4"]
-) -> tuple[Float[Tensor, "view frame point 2"], Float[Tensor, "view frame point 1"]]:
-    """Project points of the world: pixels and depth, which is above zero."""
-    projected = _projected(point, projection)
+    point: Float[Tensor, "frame 21 3"], target: KeypointTarget
+) -> tuple[
+    Float[Tensor, "view frame 21 2"],
+    Float[Tensor, "view frame 21 1"],
+    Float[Tensor, "view frame 21"],
+]:
+    """Project keypoints: pixels, depth above zero, and squared errors in units of noise."""
+    projected = _projected(point, target.projection)
     depth = projected[..., 2:]
     nearest = 1e-3 * depth.detach().abs().median()
     depth = depth.clamp(min=float(nearest) + 1e-9)
-    return projected[..., :2] / depth, depth
+    pixel = projected[..., :2] / depth
+    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
+    return pixel, depth, squared
 
 
 def _projected(

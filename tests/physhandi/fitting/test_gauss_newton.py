@@ -105,7 +105,8 @@ def _rates(frames: int, points: int, seed: int) -> PointRates:
     def drawn(columns: int) -> Tensor:
         return torch.tensor(random.normal(size=(frames, 3 * points, columns)), dtype=torch.float32)
 
-    return PointRates(drawn(POSE_COUNT), drawn(10))
+    place = torch.tensor(random.normal(size=(frames, points, 3)), dtype=torch.float32)
+    return PointRates(place, drawn(POSE_COUNT), drawn(10))
 
 
 @pytest.mark.parametrize("fits_scale", [False, True])
@@ -116,10 +117,10 @@ def test_a_step_is_that_of_the_dense_equations(frames: int, fits_scale: bool) ->
     rates, damping = _rates(frames, points, 1), 0.1
     half = torch.tensor(random.normal(size=(frames, points, 3, 3)), dtype=torch.float32)
     curvature = half @ half.transpose(-1, -2)
-    place = torch.tensor(random.normal(size=(frames, points, 3)), dtype=torch.float32)
+    place = rates.point
     angles = torch.tensor(random.uniform(0.5, 2.0, size=(frames, 15, 3)), dtype=torch.float32)
     equations = NormalEquations(frames, fits_scale=fits_scale)
-    equations.add_points(rates, curvature, place)
+    equations.add_points(rates, curvature, is_scaled=True)
     equations.add_accelerations(rates, 0.7)
     equations.add_angles(angles, 0.4)
     equations.add_shape(3.0)

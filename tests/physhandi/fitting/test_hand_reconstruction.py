@@ -148,10 +148,12 @@ def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_on
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() > 0.05
     for is_new in (True, False):
         config = HandFitConfig(
-            iterations=20,
-            depth_iterations=20,
+            gauss_newton=is_new,
+            iterations=60,
+            depth_iterations=60,
             search_iterations=20,
             starts_at_depth=is_new,
+            fixed_normals=is_new,
         )
         assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.007
 
