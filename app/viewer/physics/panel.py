@@ -151,7 +151,7 @@ class SubstepsChoice:
             hint="Integration steps a frame. Automatic takes as few as are stable at frame 0",
         )
         self._followed = FollowedChoice(choice, guard)
-        self._number: Any = gui.add_number(
+        number: Any = gui.add_number(
             "number",
             self._in_use,
             min=1,
@@ -160,9 +160,10 @@ class SubstepsChoice:
             visible=False,
             hint=PARAMETERS["substeps_per_frame"].about,
         )
-        gesture = gestures.follow(self._number)
+        self._number = FollowedChoice(number, guard)
+        gesture = gestures.follow(number)
         choice.on_update(guard.by_user(lambda _: self._take_choice()))
-        self._number.on_update(guard.by_user(lambda _: self._take_number(gesture())))
+        number.on_update(guard.by_user(lambda _: self._take_number(gesture())))
 
     def show(self) -> None:
         """Follow the history."""
@@ -177,9 +178,9 @@ class SubstepsChoice:
             else SUBSTEPS_AS_FITTED
         )
         self._followed.show(choice)
-        if choice == SUBSTEPS_BY_HAND and self._number.value != number:
-            self._number.value = number
-        self._number.visible = choice == SUBSTEPS_BY_HAND
+        if choice == SUBSTEPS_BY_HAND:
+            self._number.show(number)
+        self._number.handle.visible = choice == SUBSTEPS_BY_HAND
 
     def follow(self, readout: Readout) -> None:
         """Remember what is in use, from which typing a number begins."""
@@ -192,15 +193,19 @@ class SubstepsChoice:
             self._change(lambda: history.choose_substeps(is_automatic=is_automatic))
             return
         # Nothing is simulated anew before another number is typed.
-        number = self._number.value = self._in_use
-        self._number.visible = True
+        number = self._in_use
+        self._number.show(number)
+        self._number.handle.visible = True
         if history.is_automatic:
             changed = history.current.replace(substeps_per_frame=number)
             self._change(lambda: history.replace(changed))
 
     def _take_number(self, gesture: int) -> None:
-        number = min(max(int(self._number.value), 1), _MOST)
-        self._change(lambda: self._history.set("substeps_per_frame", number, gesture=gesture))
+        def take() -> TriedSetting:
+            number = min(max(int(self._number.read()), 1), _MOST)
+            return self._history.set("substeps_per_frame", number, gesture=gesture)
+
+        self._change(take)
 
 
 def warning(readout: Readout) -> str:

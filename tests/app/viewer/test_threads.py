@@ -247,6 +247,31 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
         assert control.handle.value == 9.0
 
 
+def test_a_number_that_is_typed_while_the_last_one_is_asked_for_is_simulated(
+    sessions: Sessions,
+) -> None:
+    with watched(sessions) as (session, _):
+        assert session._object is not None
+        panel, rollouts = session._object.panel, SlowRollouts(session)
+        panel._rollouts = rollouts
+        choice = panel._substeps
+        choice._followed.handle._impl.value = "by hand"
+        choice._take_choice()
+        write_all(session)
+        choice._number.handle._impl.value = 4
+        first = beside(lambda: choice._take_number(1))
+        assert rollouts.has_begun.wait(PATIENCE)
+        # As viser keeps what a user has typed, before it is told to anybody.
+        choice._number.handle._impl.value = 9
+        rollouts.may_end.set()
+        first.join(PATIENCE)
+        write_all(session)
+        choice._take_number(1)
+        write_all(session)
+        assert choice._number.handle.value == 9
+        assert [asked.substeps_per_frame for asked in rollouts.asked] == [4, 9]
+
+
 def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
     sessions: Sessions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
