@@ -7,6 +7,7 @@ import signal
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -219,9 +220,12 @@ class Previews:
 
     def _tidy(self, batch: list[_Source]) -> None:
         """Remove previews of what has changed since, and the oldest ones if there are too many."""
-        files = [
-            (entry.name, entry.stat().st_mtime, entry.path) for entry in os.scandir(self._folder)
-        ]
+        files = list[tuple[str, float, str]]()
+        with os.scandir(self._folder) as entries:
+            for entry in entries:
+                # Half-written files get their names, and others are removed, meanwhile.
+                with suppress(FileNotFoundError):
+                    files.append((entry.name, entry.stat().st_mtime, entry.path))
         current = {source.prefix: source.key for source in batch}
         stale = [path for name, _, path in files if _is_stale(name, current)]
         files.sort(key=lambda file: file[1])

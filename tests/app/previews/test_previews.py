@@ -198,6 +198,20 @@ def see_what_is_shown(still: Path, moving: Path) -> None:
         assert image.size == (WIDTH, HEIGHT)
 
 
+def test_a_file_that_vanishes_meanwhile_does_not_keep_the_oldest_ones(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "_MOST_FILES", 1)
+    folder = world.settings.preview_dir
+    folder.mkdir(parents=True)
+    for age, name in ((2, "older"), (1, "newer")):
+        (folder / name).touch()
+        os.utime(folder / name, (1e9 - age, 1e9 - age))
+    (folder / "vanished").symlink_to("nowhere")  # It is listed, and then is not there.
+    Previews(world.settings, world.catalog)._tidy([])
+    assert sorted(path.name for path in folder.iterdir()) == ["newer", "vanished"]
+
+
 def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
