@@ -268,11 +268,16 @@ class Uploads:
         """
         if not self._folder.is_dir():
             return []
-        return [
-            (path.name, path, max(one.stat().st_mtime for one in (path, *path.rglob("*"))))
-            for path in sorted(self._folder.iterdir())
-            if self._tasks.task("upload", path.name).state != "running"
-        ]
+        uploads = list[tuple[str, Path, float]]()
+        for path in sorted(self._folder.iterdir()):
+            if self._tasks.task("upload", path.name).state != "running":
+                times = list[float]()
+                for one in (path, *path.rglob("*")):
+                    with suppress(FileNotFoundError):  # It was removed since it was listed.
+                        times.append(one.stat().st_mtime)
+                if times:
+                    uploads.append((path.name, path, max(times)))
+        return uploads
 
     def remove_folder(self, upload_id: str) -> None:
         """Remove what is left of an upload, announced or not.

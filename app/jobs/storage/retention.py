@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -171,12 +172,13 @@ class Retention:
         if days is None and most is None:
             return
         # The index of runs is no picture or export of which there may be too many.
-        files = [
-            (status.st_mtime, status.st_size, path)
-            for place in ("previews", "exports")
-            for path in sorted((self._settings.data_dir / "cache" / place).glob("[!.]*"))
-            if (status := path.stat()) and path.is_file()
-        ]
+        files = list[tuple[float, int, Path]]()
+        for place in ("previews", "exports"):
+            for path in sorted((self._settings.data_dir / "cache" / place).glob("[!.]*")):
+                with suppress(FileNotFoundError):  # It was removed since it was listed.
+                    status = path.stat()
+                    if path.is_file():
+                        files.append((status.st_mtime, status.st_size, path))
         over = -1.0 if most is None else sum(size for _, size, _ in files) - most * 2**30
         for used, size, path in sorted(files):
             age = (now - used) / _DAY_S

@@ -161,6 +161,7 @@ def test_the_cache_shrinks_from_its_oldest_and_keeps_the_index(kept: Kept) -> No
     for number, (name, size) in enumerate(sizes.items()):
         (cache / name).write_bytes(bytes(size * 2**10))
         ended_at(cache / name, NOW - (9 - number) * DAY)
+    (cache / "previews" / "vanished").symlink_to("nowhere")  # It is listed, and then is not there.
     kept.world.catalog.reindex()
     ended_at(cache / "runs.json", NOW - 90 * DAY)
     by_size = kept.rules(cache_gib=55 / 2**20)  # 55 KiB of 90
@@ -183,6 +184,8 @@ def test_uploads_go_that_nobody_finishes(kept: Kept) -> None:
     for upload_id, days in ((old, 8), (new, 6)):
         for path in (folder / upload_id, *(folder / upload_id).rglob("*")):
             ended_at(path, NOW - days * DAY)
+        (folder / upload_id / "vanished").symlink_to("nowhere")
+        ended_at(folder / upload_id, NOW - days * DAY)
     assert kept.rules(keep_uploads_days=None).listed() == []
     (item,) = kept.rules().remove()
     assert (item.kind, item.id, item.name) == ("upload", old, f"incoming/{old}")
