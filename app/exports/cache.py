@@ -18,7 +18,7 @@ import viser
 from app.exports.request import FileRequest
 from physhandi import __version__, errors
 from physhandi.child import Child, ChildEndedError
-from physhandi.data.files import sweep_temporary, temporary_name
+from physhandi.data.files import files_by_age, sweep_temporary, temporary_name
 from physhandi.data.run_folder import CURRENT
 from physhandi.data.sequence_meta import FILE
 
@@ -224,16 +224,9 @@ class FileCache:
 
     def _make_room(self, newest: Path) -> None:
         """Remove the files that were not used for longest."""
-        entries: list[tuple[float, int, Path]] = []
-        for path in self._folder.iterdir():
-            try:
-                if path.is_file():
-                    status = path.stat()
-                    entries.append((status.st_mtime, status.st_size, path))
-            except OSError:
-                continue  # Another thread has just removed it.
+        entries = files_by_age(self._folder.iterdir())
         total = sum(size for _, size, _ in entries)
-        for _, size, path in sorted(entries):
+        for _, size, path in entries:
             if total <= self._most_bytes:
                 return
             if path != newest:

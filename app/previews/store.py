@@ -2,12 +2,10 @@
 
 import hashlib
 import logging
-import os
 import signal
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,7 +14,7 @@ from app.jobs.catalog import Catalog, NotFoundError, RunItem
 from app.previews.files import MOVING, NONE, SECONDS_EACH, STILL
 from app.settings import ServerSettings
 from physhandi.child import Child, ChildEndedError
-from physhandi.data.files import write_bytes
+from physhandi.data.files import files_by_age, write_bytes
 from physhandi.data.run_folder import CURRENT
 from physhandi.data.sequence_meta import FILE
 from physhandi.errors import PhysHandiError
@@ -220,17 +218,10 @@ class Previews:
 
     def _tidy(self, batch: list[_Source]) -> None:
         """Remove previews of what has changed since, and the oldest ones if there are too many."""
-        files = list[tuple[str, float, str]]()
-        with os.scandir(self._folder) as entries:
-            for entry in entries:
-                # Half-written files get their names, and others are removed, meanwhile.
-                with suppress(FileNotFoundError):
-                    files.append((entry.name, entry.stat().st_mtime, entry.path))
+        files = [path for _, _, path in files_by_age(self._folder.iterdir())]
         current = {source.prefix: source.key for source in batch}
-        stale = [path for name, _, path in files if _is_stale(name, current)]
-        files.sort(key=lambda file: file[1])
-        _remove(stale)
-        _remove(path for _, _, path in files[: max(0, len(files) - _MOST_FILES)])
+        _remove(path for path in files if _is_stale(path.name, current))
+        _remove(files[: max(0, len(files) - _MOST_FILES)])
 
 
 def _source(kind: PreviewKind, item_id: str, folder: Path, watched: str) -> _Source | None:
@@ -246,6 +237,6 @@ def _is_stale(name: str, current: dict[str, str]) -> bool:
     return prefix in current and stem != current[prefix]
 
 
-def _remove(paths: Iterable[str]) -> None:
+def _remove(paths: Iterable[Path]) -> None:
     for path in paths:
-        Path(path).unlink(missing_ok=True)
+        path.unlink(missing_ok=True)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path, PurePath
+from stat import S_ISREG
 from typing import Any, BinaryIO, ClassVar, cast
 
 import psutil
@@ -42,6 +43,23 @@ def is_abandoned(path: Path) -> bool:
     if len(fields) != 3 or fields[0] != _HOST or not fields[1].isdigit():
         return False
     return int(fields[1]) != os.getpid() and not psutil.pid_exists(int(fields[1]))
+
+
+def files_by_age(paths: Iterable[Path]) -> list[tuple[float, int, Path]]:
+    """List files, the oldest first, passing over what was removed since it was listed.
+
+    Returns:
+        Of each when it changed last [s since 1970], its size [B] and its path.
+    """
+    files = list[tuple[float, int, Path]]()
+    for path in paths:
+        try:
+            status = path.stat()
+        except OSError:
+            continue
+        if S_ISREG(status.st_mode):
+            files.append((status.st_mtime, status.st_size, path))
+    return sorted(files)
 
 
 def sweep_temporary(paths: Iterator[Path]) -> int:

@@ -10,7 +10,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +19,7 @@ from app.jobs.recordings.uploads import Uploads
 from app.jobs.scheduler import Scheduler
 from app.settings import ServerSettings
 from physhandi.data.attempt import PREVIEW
+from physhandi.data.files import files_by_age
 from physhandi.data.run_folder import ATTEMPTS, EXIT, LOG
 from physhandi.errors import PhysHandiError, describe
 from physhandi.run import Run
@@ -172,15 +172,10 @@ class Retention:
         if days is None and most is None:
             return
         # The index of runs is no picture or export of which there may be too many.
-        files = list[tuple[float, int, Path]]()
-        for place in ("previews", "exports"):
-            for path in sorted((self._settings.data_dir / "cache" / place).glob("[!.]*")):
-                with suppress(FileNotFoundError):  # It was removed since it was listed.
-                    status = path.stat()
-                    if path.is_file():
-                        files.append((status.st_mtime, status.st_size, path))
+        folders = (self._settings.data_dir / "cache" / place for place in ("previews", "exports"))
+        files = files_by_age(path for folder in folders for path in folder.glob("[!.]*"))
         over = -1.0 if most is None else sum(size for _, size, _ in files) - most * 2**30
-        for used, size, path in sorted(files):
+        for used, size, path in files:
             age = (now - used) / _DAY_S
             if days is not None and age > days:
                 yield Expendable("cache", self._named(path), size, age, "PHYSHANDI_KEEP_CACHE_DAYS")
