@@ -62,7 +62,7 @@ from physhandi.fitting.hands.poses import (
     step_share,
 )
 from physhandi.fitting.hands.search import SearchedHand, search_hand
-from physhandi.fitting.hands.smoothing import best_strength, smoothed_pose
+from physhandi.fitting.hands.smoothing import best_strengths, smoothed_pose
 from physhandi.fitting.hands.wrist_guess import (
     WristGuess,
     guess_wrist,
@@ -398,15 +398,14 @@ class HandProblem:
         fitted, target = dict(self.parameters), self.target
         seen = float(target.weight.sum())
 
-        def error(strength: float) -> float:
-            hands = PosedHands(self.model, fitted | smoothed_pose(fitted, strength))
+        def error(fingers: float, wrist: float) -> float:
+            hands = PosedHands(self.model, fitted | smoothed_pose(fitted, fingers, wrist))
             point = hands.keypoints() * fitted["log_scale"].exp()
             return float(keypoint_costs(point, target, self.config.doubt).sum()) / max(seen, 1.0)
 
-        strength = best_strength(error, len(fitted["translation"]), 2.0 * seen)
-        if strength > 0.0:
-            for name, value in smoothed_pose(fitted, strength).items():
-                self.parameters[name].copy_(value)
+        fingers, wrist = best_strengths(error, len(fitted["translation"]), 2.0 * seen)
+        for name, value in smoothed_pose(fitted, fingers, wrist).items():
+            self.parameters[name].copy_(value)
 
     def _place_by_depth(self, target: DepthTarget) -> None:
         """Move the hand to where depth was measured, if keypoints left it out of the loss's reach.

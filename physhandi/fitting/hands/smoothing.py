@@ -1,12 +1,15 @@
 """How smooth a hand's motion is, as its keypoints tell.
 
 A fit takes over a part of what the keypoints of each frame err by, and the hand trembles. How fast
-it really moves is not known beforehand, so a strength of smoothing is chosen for each recording:
-the one with which the frames would best predict each other's keypoints (generalised
-cross-validation, Craven and Wahba 1979; the smoother is Whittaker's, 1923).
+it really moves is not known beforehand, so strengths of smoothing are chosen for each recording:
+those with which the frames would best predict each other's keypoints (generalised
+cross-validation, Craven and Wahba 1979; the smoother is Whittaker's, 1923). Fingers and wrist have
+one each, since fingers that hold something move far more slowly than the wrist that carries it.
 """
 
+import math
 from collections.abc import Callable, Mapping
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -17,9 +20,10 @@ from torch import Tensor
 
 from physhandi.rotations import without_jumps
 
-FREEDOM = 26
-"""Numbers by which a real hand is posed in a frame: 20 angles of fingers, 6 of the wrist."""
-STRENGTHS = 10.0 ** np.arange(-2.0, 3.01, 0.25)
+FINGERS, WRIST = 20, 6
+"""Numbers by which a real hand is posed in a frame: angles of the fingers, and place and rotation
+of the wrist."""
+STRENGTHS = (0.0, *(10.0 ** np.arange(-2.0, 3.01, 0.25)).tolist())
 """Weights of squared second differences that are tried, beside those of what is smoothed."""
 
 
@@ -49,10 +53,21 @@ def freedom_left(frame_count: int, strength: float) -> float:
     return float((1.0 / (1.0 + strength * (2.0 * np.sin(frequency / 2.0)) ** 4)).sum())
 
 
-def smoothed_pose(parameters: Mapping[str, Tensor], strength: float) -> dict[str, Tensor]:
-    """Smooth ``articulation``, ``rotation`` (a quaternion) and ``translation`` of a hand."""
+def smoothed_pose(
+    parameters: Mapping[str, Tensor], fingers: float, wrist: float
+) -> dict[str, Tensor]:
+    """Smooth the motion of a hand.
+
+    Args:
+        parameters: With ``articulation``, ``rotation`` (a quaternion) and ``translation``.
+        fingers: Strength for the articulation.
+        wrist: Strength for rotation and translation.
+
+    Returns:
+        These three, smoothed.
+    """
     pose: dict[str, Tensor] = {}
-    for name in ("articulation", "rotation", "translation"):
+    for name, strength in (("articulation", fingers), ("rotation", wrist), ("translation", wrist)):
         value = parameters[name].detach().double().numpy()
         if name == "rotation":
             value = without_jumps(value / np.linalg.norm(value, axis=-1, keepdims=True))
@@ -63,24 +78,36 @@ def smoothed_pose(parameters: Mapping[str, Tensor], strength: float) -> dict[str
     return pose
 
 
-def best_strength(
-    error: Callable[[float], float], frame_count: int, coordinate_count: float
-) -> float:
-    """Choose how much a hand's motion is smoothed; 0 for not at all.
+def best_strengths(
+    error: Callable[[float, float], float], frame_count: int, coordinate_count: float
+) -> tuple[float, float]:
+    """Choose how much the motions of fingers and wrist are smoothed; 0 for not at all.
+
+    The best one for both is chosen first, and then for each of them in turn, until none changes.
 
     Args:
-        error: Computes the mean error of all keypoints, squared, of the motion that is smoothed
-            with a strength.
+        error: Computes the mean error of all keypoints, squared, of the motion whose fingers and
+            wrist are smoothed with two strengths.
         frame_count: Frames of the motion.
         coordinate_count: Coordinates of keypoints that were seen, in all views and frames, of which
             one that is half trusted counts half.
+
+    Returns:
+        Strength for the fingers, and for the wrist.
     """
-    best, least = 0.0, np.inf
-    for strength in (0.0, *STRENGTHS.tolist()):
-        left = 1.0 - FREEDOM * freedom_left(frame_count, strength) / max(coordinate_count, 1.0)
-        if left <= 0.0:  # Keypoints are too few to tell motion as free as this.
-            continue
-        expected = error(strength) / left**2
-        if expected < least:
-            best, least = strength, expected
+    freedom = cache(partial(freedom_left, frame_count))
+
+    @cache
+    def expected(strengths: tuple[float, float]) -> float:
+        fingers, wrist = strengths
+        numbers = FINGERS * freedom(fingers) + WRIST * freedom(wrist)
+        left = 1.0 - numbers / max(coordinate_count, 1.0)
+        # Keypoints may be too few to tell motion as free as this.
+        return error(fingers, wrist) / left**2 if left > 0.0 else math.inf
+
+    best, least = min(((both, both) for both in STRENGTHS), key=expected), math.inf
+    while expected(best) < least:
+        least = expected(best)
+        best = min(((fingers, best[1]) for fingers in STRENGTHS), key=expected)
+        best = min(((best[0], wrist) for wrist in STRENGTHS), key=expected)
     return best

@@ -10,9 +10,10 @@ from support.physics import hand_scene as scene
 
 from physhandi.fitting.hand_reconstruction import HandFitConfig, reconstruct_hands
 from physhandi.fitting.hands.smoothing import (
-    FREEDOM,
+    FINGERS,
     STRENGTHS,
-    best_strength,
+    WRIST,
+    best_strengths,
     freedom_left,
     smoothed,
     smoothed_pose,
@@ -51,33 +52,58 @@ def test_a_rotation_is_smoothed_whichever_of_its_two_quaternions_it_is() -> None
         "rotation": torch.tensor(flipped, dtype=torch.float32),
         "translation": torch.zeros(20, 3),
     }
-    found = smoothed_pose(pose, 1.0)["rotation"].double().numpy()
-    assert np.abs((found * turn).sum(axis=1)) == pytest.approx(1.0, abs=1e-4)
-    assert (found[1:] * found[:-1]).sum(axis=1).min() > 0.9
+    rotation = smoothed_pose(pose, 0.0, 1.0)["rotation"].double().numpy()
+    assert np.abs((rotation * turn).sum(axis=1)) == pytest.approx(1.0, abs=1e-4)
+    assert (rotation[1:] * rotation[:-1]).sum(axis=1).min() > 0.9
 
 
-@pytest.mark.parametrize("period", [8.0, 200.0])
-def test_the_strength_is_about_the_one_that_comes_nearest_to_the_true_motion(period: float) -> None:
+def test_fingers_and_wrist_are_smoothed_each_with_its_own_strength() -> None:
+    series = np.random.default_rng(4).normal(size=(20, 3))
+    pose = {
+        "articulation": torch.tensor(series[:, None]),
+        "rotation": torch.tensor(np.column_stack([0.1 * series, np.ones(20)])),
+        "translation": torch.tensor(series),
+    }
+    motion = smoothed_pose(pose, 10.0, 0.1)
+    assert motion["articulation"][:, 0].numpy() == pytest.approx(smoothed(series, 10.0), abs=1e-5)
+    assert motion["translation"].numpy() == pytest.approx(smoothed(series, 0.1), abs=1e-5)
+    angle = motion["rotation"][:, :3] / motion["rotation"][:, 3:]
+    assert angle.numpy() == pytest.approx(0.1 * smoothed(series, 0.1), abs=0.01)
+
+
+@pytest.mark.parametrize("periods", [(8.0, 200.0), (200.0, 8.0), (200.0, 200.0)])
+def test_the_strengths_are_about_those_that_come_nearest_to_the_true_motion(
+    periods: tuple[float, float],
+) -> None:
     random = np.random.default_rng(2)
-    shape = (80, FREEDOM)
-    true = np.sin(2 * np.pi * np.arange(80)[:, None] / period + random.uniform(0, 6, FREEDOM))
+    parts = slice(FINGERS), slice(FINGERS, None)
+    period = np.repeat(periods, (FINGERS, WRIST))
+    start = random.uniform(0, 6, FINGERS + WRIST)
+    true = np.sin(2 * np.pi * np.arange(80)[:, None] / period + start)
     # Each number is measured twice, and the fit is the mean.
-    seen = true + 0.1 * random.normal(size=(2, *shape))
+    seen = true + 0.1 * random.normal(size=(2, *true.shape))
     fitted = seen.mean(axis=0)
-    chosen = best_strength(
-        lambda strength: float(((smoothed(fitted, strength) - seen) ** 2).mean()),
+
+    def motion(*strengths: float) -> ndarray:
+        each = zip(parts, strengths, strict=True)
+        return np.concatenate([smoothed(fitted[:, part], s) for part, s in each], axis=1)
+
+    chosen = best_strengths(
+        lambda *strengths: float(((motion(*strengths) - seen) ** 2).mean()),
         frame_count=80,
         coordinate_count=float(seen.size),
     )
-    off = {s: ((smoothed(fitted, s) - true) ** 2).mean() for s in (0.0, *STRENGTHS.tolist())}
-    assert off[chosen] < 1.1 * min(off.values())
-    assert chosen < 1.0 if period < 10 else chosen > 10.0
+    for part, strength, its_period in zip(parts, chosen, periods, strict=True):
+        off = {s: ((smoothed(fitted[:, part], s) - true[:, part]) ** 2).mean() for s in STRENGTHS}
+        assert off[strength] < 1.5 * min(off.values())
+        assert strength < 1.0 if its_period < 10 else strength > 10.0
 
 
 def test_too_few_keypoints_tell_nothing_of_a_motion_that_is_too_free_for_them() -> None:
-    chosen = best_strength(lambda _: 1.0, frame_count=50, coordinate_count=50 * FREEDOM / 4)
-    assert 0.25 * 50 > freedom_left(50, chosen) > 1.0
-    assert best_strength(lambda _: 1.0, frame_count=50, coordinate_count=0.0) == 0.0
+    count = 50 * (FINGERS + WRIST)
+    fingers, wrist = best_strengths(lambda *_: 1.0, frame_count=50, coordinate_count=count / 4)
+    assert 0.25 * count > FINGERS * freedom_left(50, fingers) + WRIST * freedom_left(50, wrist)
+    assert best_strengths(lambda *_: 1.0, frame_count=50, coordinate_count=0.0) == (0.0, 0.0)
 
 
 def test_a_hand_trembles_less_than_its_keypoints_and_is_nearer_to_the_true_one(
