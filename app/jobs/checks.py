@@ -4,6 +4,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from app.jobs.catalog import SequenceItem
+from physhandi.data.files import files_by_age
 from physhandi.fitting.checks.recording_check import RecordingCheck, check_recording
 
 
@@ -11,15 +12,9 @@ def check_item(item: SequenceItem) -> RecordingCheck:
     """Read a whole listed recording, usable or not, unless it was read as it is before."""
     if item.sequence is None:
         return check_recording(item.folder)
-    return _checked(item.folder, _state(item.folder))
+    return _checked(item.folder, tuple(files_by_age(item.folder.rglob("*"))))
 
 
 @lru_cache(maxsize=64)
-def _checked(folder: Path, _state: tuple[tuple[str, int, int], ...]) -> RecordingCheck:
+def _checked(folder: Path, _state: tuple[tuple[float, int, Path], ...]) -> RecordingCheck:
     return check_recording(folder)
-
-
-def _state(folder: Path) -> tuple[tuple[str, int, int], ...]:
-    """Give name, size and time of every file."""
-    files = ((path, path.stat()) for path in sorted(folder.rglob("*")) if path.is_file())
-    return tuple((str(path), status.st_size, status.st_mtime_ns) for path, status in files)

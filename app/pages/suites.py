@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.jobs.catalog import NotFoundError
 from app.pages.metrics import about_quantity, figure, scaled, unit_of_metric
 from app.pages.render import Pages
+from physhandi.data.files import files_by_age
 from physhandi.data.run_folder import read_json
 from physhandi.errors import PhysHandiError, RunError
 from physhandi.metrics.suite_report import (
@@ -138,8 +139,9 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
 
 
 def _folders(folder: Path) -> list[Path]:
-    suites = [path.parent for path in folder.glob("*/cells.json") if _has_page(path.parent)]
-    return sorted(suites, key=lambda path: (path / "cells.json").stat().st_mtime_ns, reverse=True)
+    """List suites, the newest first."""
+    suites = [path.parent for _, _, path in files_by_age(folder.glob("*/cells.json"))]
+    return [path for path in reversed(suites) if _has_page(path)]
 
 
 def _has_page(path: Path) -> bool:

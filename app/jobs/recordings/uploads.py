@@ -21,7 +21,7 @@ from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
 from app.jobs.recordings.upload_names import check_names, is_left_out, quoted_name
 from app.jobs.storage.room import NoRoomError, Room
 from app.settings import ServerSettings
-from physhandi.data.files import write_json
+from physhandi.data.files import files_by_age, write_json
 from physhandi.data.run_folder import Text, WholeNumber, checked, read_json
 from physhandi.errors import RunError, UsageError
 
@@ -122,13 +122,11 @@ class Uploads:
 
     def unfinished(self) -> list[dict[str, Any]]:
         """Describe all that are not being checked, the oldest first."""
-        if not self._folder.is_dir():
-            return []
-        folders = sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)
         uploads: list[dict[str, Any]] = []
-        for folder in folders:
-            with suppress(UnknownUploadError):  # What was never announced goes with the old ones.
-                uploads.append(self.describe(folder.name))
+        # What was never announced goes with the old ones.
+        for _, _, about in files_by_age(self._folder.glob(f"*/{_ABOUT}")):
+            with suppress(UnknownUploadError):
+                uploads.append(self.describe(about.parent.name))
         return [one for one in uploads if "files" in one]
 
     def describe(self, upload_id: str) -> dict[str, Any]:
