@@ -19,6 +19,9 @@ from physhandi import pipeline
 from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
 from support.inputs.sheet_sequence import sheet_config
+from support.server.route_checks import share_checks
+
+share_checks()
 
 TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
 HOST = "127.0.0.1:8080"
