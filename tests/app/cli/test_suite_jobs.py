@@ -131,7 +131,7 @@ def test_nodes_that_differ_stop_the_suite_in_their_words(
 ) -> None:
     out = tmp_path / "suite"
     environment = describe_environment("cpu") | {"device_name": "abacus"}
-    other = replace(order, environment=environment)
+    other = replace(order, methods=("static",), environment=environment)
     fill = jobs_of(cluster, out, Deed()).fill(other, out)
     with pytest.raises(UsageError, match="where the table's others have abacus"):
         evaluate_suite(other, out, fill=fill)

@@ -237,27 +237,28 @@ def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
 
 def test_what_computes_for_too_long_is_ended_and_what_waits_is_not() -> None:
     code = (
-        "import app.previews.worker as worker, os, signal\n"
+        "import app.previews.worker as worker, signal\n"
         "from physhandi.child import run_child\n"
-        "worker.SECONDS_EACH = 1\n"
+        "worker.SECONDS_EACH = 0.1\n"
         "def draw(order, *, is_still):\n"
-        "    while order['kind'] == 'endless': pass\n"
         "    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)\n"
+        "    print(order['kind'], flush=True)\n"
+        "    while order['kind'] == 'endless': pass\n"
         "worker.draw = draw\n"
         "run_child(worker.draw_all)\n"
     )
-
-    def end(kind: str) -> int:
-        return subprocess.run(
-            [sys.executable, "-c", code],
-            input=json.dumps({"kind": kind}).encode(),
-            cwd=PACKAGE_ROOT,
-            timeout=LIMIT_S,
-            check=False,
-        ).returncode
-
-    assert end("sequence") == 0
-    assert end("endless") in {-signal.SIGKILL, -signal.SIGXCPU}
+    orders = [json.dumps({"kind": kind}) + "\n" for kind in ("sequence", "endless", "late")]
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        input="".join(orders),
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=PACKAGE_ROOT,
+        timeout=LIMIT_S,
+        check=False,
+    )
+    assert ended.stderr.split() == ["sequence", "endless"]
+    assert ended.returncode in {-signal.SIGKILL, -signal.SIGXCPU}
 
 
 def test_a_folder_that_is_deleted_while_pictures_are_drawn_ends_nothing(

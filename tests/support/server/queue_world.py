@@ -21,7 +21,10 @@ from app.server import create_app
 from app.settings import ServerSettings
 from app.viewer.sessions import TooManySessionsError
 from physhandi.data.run_folder import read_events
+from support.server.route_checks import share_checks
 from support.waiting import LIMIT_S, until
+
+share_checks()
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 

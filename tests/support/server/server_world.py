@@ -1,10 +1,14 @@
 """A server inside the test's process, and a small finished run for it to show."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any
 
+import anyio
+from anyio.from_thread import BlockingPortal
 from fastapi import FastAPI
 from pydantic import SecretStr
 from starlette.testclient import TestClient
@@ -19,10 +23,30 @@ from physhandi import pipeline
 from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
 from support.inputs.sheet_sequence import sheet_config
+from support.server.route_checks import share_checks
+
+share_checks()
 
 TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
 HOST = "127.0.0.1:8080"
 ORIGIN = f"http://{HOST}"
+
+
+@cache
+def event_loop() -> BlockingPortal:
+    """The event loop that all worlds of this process share, as requests to one server do.
+
+    A client that has none makes one for each request, which is half of what a request takes.
+    """
+    begun: SimpleQueue[BlockingPortal] = SimpleQueue()
+
+    async def serve() -> None:
+        async with BlockingPortal() as portal:
+            begun.put(portal)
+            await portal.sleep_until_stopped()
+
+    Thread(target=anyio.run, args=(serve,), name="event-loop", daemon=True).start()
+    return begun.get()
 
 
 @dataclass(frozen=True)
@@ -47,9 +71,11 @@ class World:
 
     def client(self, **headers: str) -> TestClient:
         """A client that sends nothing but these headers by itself."""
-        return TestClient(
+        client = TestClient(
             self.app, base_url=ORIGIN, headers=headers, follow_redirects=False, client=("tester", 1)
         )
+        client.portal = event_loop()
+        return client
 
     def script(self) -> TestClient:
         """A client with the token in its header."""
