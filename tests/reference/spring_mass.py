@@ -4,9 +4,11 @@ Cases of one scene are simulated at once if fields have an axis of cases before 
 """
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_array
 
 
 @dataclass
@@ -40,22 +42,31 @@ class Scene:
 
 
 def incidence(scene, count):
-    """Tell which springs leave (-1) and reach (1) which of `count` nodes, spring x node."""
-    number = np.arange(len(scene.springs))
-    table = np.zeros((len(scene.springs), count))
-    table[number, scene.springs[:, 0]] = -1.0
-    table[number, scene.springs[:, 1]] += 1.0
-    return table
+    """Tell which springs leave (-1) and reach (1) which of `count` nodes: spring x node, turned."""
+    springs = len(scene.springs)
+    place = np.repeat(np.arange(springs), 2), scene.springs.ravel()
+    table = coo_array((np.tile([-1.0, 1.0], springs), place), shape=(springs, count))
+    return table.tocsr(), table.T.tocsr()
+
+
+def times(table, values):
+    """Multiply a sparse table with values whose last axis but one it sums over, in every case."""
+    if values.ndim == 2:
+        return table @ values
+    first = np.moveaxis(values, -2, 0)
+    product = table @ first.reshape(len(first), math.prod(first.shape[1:]))
+    return np.moveaxis(product.reshape(-1, *first.shape[1:]), 0, -2)
 
 
 def spring_force(scene, joins, x, v):
     """Force on every node; `joins` is the incidence of all springs."""
-    gap, rate = joins @ x, joins @ v
+    along, into = joins
+    gap, rate = times(along, x), times(along, v)
     length = np.sqrt((gap**2).sum(-1))
     unit = gap / np.maximum(length, 1e-6)[..., None]
     tension = scene.stiffness * (length / scene.rest - 1.0)
     tension = tension + scene.damping * (unit * rate).sum(-1)
-    return -joins.T @ (tension[..., None] * unit)
+    return -times(into, tension[..., None] * unit)
 
 
 def move_on_ground(scene, x, v, dt, plane):
@@ -65,13 +76,16 @@ def move_on_ground(scene, x, v, dt, plane):
     moved, velocity = x + dt * v, v.copy()
     if hits.any():
         e, mu = np.clip(scene.restitution, 0, 1), np.clip(scene.friction, 0, 2)
-        e, mu = (np.broadcast_to(each[..., None], hits.shape)[hits] for each in (e, mu))
-        v_normal, v_tangent = v[hits] * [0.0, 0.0, 1.0], v[hits] * [1.0, 1.0, 0.0]
-        slide = np.sqrt((v_tangent**2).sum(1))
-        loss = mu * (1 + e) * np.sqrt((v_normal**2).sum(1)) / np.maximum(slide, 1e-6)
-        bounced = np.maximum(0.0, 1.0 - loss)[:, None] * v_tangent - e[:, None] * v_normal
-        impact = (gap[hits] / -v[hits][:, 2])[:, None]
-        moved[hits] = x[hits] + impact * v[hits] + (dt - impact) * bounced
+        if hits.ndim > 1:
+            e, mu = (np.broadcast_to(each[..., None], hits.shape)[hits] for each in (e, mu))
+        before = v[hits]
+        speed = -before[:, 2]
+        slide = np.sqrt(before[:, 0] ** 2 + before[:, 1] ** 2)
+        remains = np.maximum(0.0, 1.0 - mu * (1 + e) * speed / np.maximum(slide, 1e-6))
+        bounced = before * remains[:, None]
+        bounced[:, 2] = e * speed
+        impact = (gap[hits] / speed)[:, None]
+        moved[hits] = x[hits] + impact * before + (dt - impact) * bounced
         velocity[hits] = bounced
     return moved, velocity
 
@@ -114,42 +128,44 @@ def collisions(scene, may, x, v):
 
 
 def nearest_of(corners, point):
-    """Weights of a triangle's point nearest to a point, and how far that is, by least squares."""
-    best = None
+    """Weights of each triangle's point nearest to each point, and how far that is.
+
+    Of the least squares of the triangle, its sides and its corners, the nearest is taken that has
+    no negative weight.
+    """
+    shape = len(point), len(corners)
+    least, best = np.full(shape, np.inf), np.zeros((*shape, 3))
     for chosen in ([0, 1, 2], [0, 1], [0, 2], [1, 2], [0], [1], [2]):
-        base, sides = corners[chosen[0]], (corners[chosen[1:]] - corners[chosen[0]]).T
-        part = np.linalg.lstsq(sides, point - base, rcond=None)[0]
-        weight = np.zeros(3)
-        weight[chosen] = [1.0 - part.sum(), *part]
-        if weight.min() >= 0.0:
-            gap = np.linalg.norm(point - weight @ corners)
-            if best is None or gap < best[1]:
-                best = weight, gap
-    return best
+        base = corners[:, chosen[0]]
+        sides = np.swapaxes(corners[:, chosen[1:]] - base[:, None], 1, 2)
+        part = np.einsum("tki,nti->ntk", np.linalg.pinv(sides), point[:, None] - base)
+        weight = np.zeros((*shape, 3))
+        weight[..., chosen[0]], weight[..., chosen[1:]] = 1.0 - part.sum(-1), part
+        gap = np.linalg.norm(point[:, None] - np.einsum("ntk,tki->nti", weight, corners), axis=2)
+        nearer = (weight.min(-1) >= 0.0) & (gap < least)
+        least[nearer], best[nearer] = gap[nearer], weight[nearer]
+    return best, least
 
 
 def triangles_beside(scene, x, place):
     """Which triangle may push each node in a frame that starts like this (-1: none), and where."""
     held = {min(ends) for ends, k in zip(scene.springs, scene.stiffness, strict=True)
             if max(ends) >= len(x) and k > 0.0}  # fmt: skip
-    number, weights = np.full(len(x), -1), np.zeros((len(x), 3))
-    for node in set(range(len(x))) - held:
-        each = []
-        for face in scene.hand:
-            corners = place[face]
-            weight, gap = nearest_of(corners, x[node])
-            normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-            height = (x[node] - corners[0]) @ normal / np.linalg.norm(normal)
-            size = max(np.linalg.norm(corners[i] - corners[i - 1]) for i in range(3))
-            each.append((gap, height, size, weight))
-        least = min(gap for gap, *_ in each)
-        same = [i for i, (gap, *_) in enumerate(each) if gap**2 <= least**2 * (1 + 1e-4)]
-        best = max(same, key=lambda i: abs(each[i][1]))
-        gap, height, size, weight = each[best]
-        aside = np.sqrt(max(gap**2 - height**2, 0.0))
-        if gap < 6 * size and height > -3 * size and aside < 0.7 * size:
-            number[node], weights[node] = best, weight
-    return number, weights
+    corners = place[scene.hand]
+    weights, gaps = nearest_of(corners, x)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    heights = ((x[:, None] - corners[:, 0]) * normal).sum(2)
+    sizes = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    least = gaps.min(axis=1, keepdims=True)
+    same = gaps**2 <= least**2 * (1 + 1e-4)
+    best = np.where(same, np.abs(heights), -1.0).argmax(axis=1)
+    node = np.arange(len(x))
+    gap, height, size = gaps[node, best], heights[node, best], sizes[best]
+    aside = np.sqrt(np.maximum(gap**2 - height**2, 0.0))
+    beside = (gap < 6 * size) & (height > -3 * size) & (aside < 0.7 * size)
+    beside &= ~np.isin(node, list(held))
+    return np.where(beside, best, -1), np.where(beside[:, None], weights[node, best], 0.0)
 
 
 def pushes(scene, beside, state, force, held, rate):

@@ -1,5 +1,6 @@
 """Whether depth and calibration fit together: the table's plane, and surfaces that views share."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,14 +68,14 @@ def find_table(
     thickness = np.maximum(_THICKNESS, _RELATIVE * np.linalg.norm(point - eye.mean(0), axis=1))
     best: Bool[ndarray, " point"] = np.zeros(len(point), bool)
     most = 0
-    for _ in range(_ROUNDS):
-        a, b, c = point[random.choice(len(point), 3, replace=False)]
-        across = np.cross(b - a, c - a)
-        length = float(np.linalg.norm(across))
+    drawn = [random.choice(len(point), 3, replace=False) for _ in range(_ROUNDS)]
+    a, b, c = np.swapaxes(point[np.array(drawn)], 0, 1)
+    for corner, across in zip(a, np.cross(b - a, c - a), strict=True):
+        length = math.sqrt(across @ across)
         if length < 1e-6:
             continue
         normal = across / length
-        is_on = np.abs(point @ normal - a @ normal) < thickness
+        is_on = np.abs(point @ normal - corner @ normal) < thickness
         count = np.count_nonzero(is_on)
         if count > most:
             best, most = is_on, count

@@ -12,7 +12,7 @@ from physhandi.benchmarks.phystwin_like import PhysTwinLike
 from physhandi.errors import UsageError
 from physhandi.simulation.engines.batch import losses_at_once
 
-SMALL = {"node_count": 60, "frame_count": 3, "candidate_count": 5, "substeps_per_frame": 200}
+SMALL = {"node_count": 60, "frame_count": 3, "candidate_count": 5, "substeps_per_frame": 100}
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def test_a_batch_is_timed_a_candidate_and_compared(device):
     # The baseline's atomics add in any order, and a node may touch the ground a substep earlier.
     assert 0.0 < result["max_abs_difference_m"] < (2e-6 if device == "cpu" else 5e-5)
     assert 2e-3 < result["motion_m"] < 0.02
-    assert result["bytes_per_frame"] == 200 * 48 * 60
+    assert result["bytes_per_frame"] == 100 * 48 * 60
 
 
 def test_a_shared_batch_is_timed_and_compared_with_the_whole_one(monkeypatch):

@@ -20,7 +20,7 @@ KEYS = {
     "frames", "load_average", "stable_substeps", "motion_m", "bytes_per_frame", "bytes_formula",
     "bandwidth_fraction", "copy_gigabytes_per_s",
 }  # fmt: skip
-SMALL = {"node_count": 60, "frame_count": 3, "substeps_per_frame": 200}
+SMALL = {"node_count": 60, "frame_count": 3, "substeps_per_frame": 100}
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +50,7 @@ def test_a_rollout_is_timed_and_compared(device):
     result = benchmark_rollout(device=device, **SMALL)
     check(result, device)
     # 20 B a spring, 48 B a node and 24 B for each of nine control nodes.
-    assert result["bytes_per_frame"] == 200 * (20 * result["springs"] + 48 * 60 + 24 * 9)
+    assert result["bytes_per_frame"] == 100 * (20 * result["springs"] + 48 * 60 + 24 * 9)
     assert "20 B x springs + 48 B x nodes + 24 B x control nodes" in result["bytes_formula"]
 
 
@@ -59,12 +59,12 @@ def test_a_gradient_is_timed_and_compared(device):
     check(result, device)
     assert result["gradient_norm"] > 1e-3
     assert 0.0 < result["gradient_relative_difference"] < 1e-4
-    assert result["bytes_per_frame"] == 200 * (56 * result["springs"] + 168 * 60 + 48 * 9)
+    assert result["bytes_per_frame"] == 100 * (56 * result["springs"] + 168 * 60 + 48 * 9)
     # A position, a velocity and a velocity before contact, of four floats each; on a CPU the
     # control nodes too, in one part or in both.
     assert result["stored_frames"] == 3
-    least = 3 * 200 * 60 * 48
-    assert least <= result["trajectory_bytes"] <= least + 3 * 32 * (60 + 201 * 18)
+    least = 3 * 100 * 60 * 48
+    assert least <= result["trajectory_bytes"] <= least + 3 * 32 * (60 + 101 * 18)
 
 
 def test_another_physics_is_not_called_the_same(device, monkeypatch):

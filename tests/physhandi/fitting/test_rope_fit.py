@@ -128,7 +128,7 @@ def test_a_balance_of_moments_needs_every_node_in_every_frame():
 
 def test_a_fitted_rope_predicts_how_it_moves_when_it_is_swung_otherwise():
     problem = swung_rope(60.0, 12.0, 0.03)
-    config = CONFIG.object_.replace(rope_steps=3)
+    config = CONFIG.object_.replace(rope_steps=2)
     started = start_rope([problem], CONFIG.simulation, config, NullProgress())
     assert started.loss_after < 0.5 * started.loss_before
     fit = fit_rope([problem], started.parameters, config, NullProgress())

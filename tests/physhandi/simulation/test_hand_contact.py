@@ -54,24 +54,24 @@ def given_back(speed, load=0.0):
 
 
 def test_a_node_inside_comes_out_slowly(device):
-    scene = on_a_plate([0.0, 0.0, -0.001], frames=4, substeps=2000)
+    scene = on_a_plate([0.0, 0.0, -0.001], frames=3, substeps=1000)
     velocity = run(scene, device).velocity[:, 0, 2]
     assert velocity[-1] == pytest.approx(given_back(0.0, 1e5 * 1e-6 / 2), rel=1e-3)
 
 
 def test_a_moving_hand_takes_a_node_along(device):
     # The hand comes at 3 mm a frame and gives more than half of its speed on top.
-    scene = on_a_plate([0.0, 0.0, 0.001], moves=[0.0, 0.0, 0.003], frames=4, substeps=2000)
+    scene = on_a_plate([0.0, 0.0, 0.001], moves=[0.0, 0.0, 0.003], frames=4, substeps=500)
     speed = 0.09 + given_back(-0.09)
     assert speed == pytest.approx(0.1458, abs=1e-4)
     assert run(scene, device).velocity[-1, 0, 2] == pytest.approx(speed, rel=2e-3)
     # Weight brings it back: then it moves with the hand.
     lifted = on_a_plate(
-        [0.0, 0.0, 0.001], moves=[0.0, 0.0, 0.003], frames=20, gravity=9.81, substeps=1000
+        [0.0, 0.0, 0.001], moves=[0.0, 0.0, 0.003], frames=8, gravity=9.81, substeps=700
     )
     heavy = run(lifted, device)
     assert heavy.velocity[-1, 0, 2] == pytest.approx(0.09, rel=1e-3)
-    assert heavy.position[-1, 0, 2] == pytest.approx(19 * 0.003 - 9.81e-5, abs=1e-5)
+    assert heavy.position[-1, 0, 2] == pytest.approx(7 * 0.003 - 9.81e-5, abs=1e-5)
     # A hand that goes away leaves it alone.
     way = scene.control - scene.control[0]
     away = run(replace(scene, control=scene.control[0] - way), device)
