@@ -28,7 +28,7 @@ from support.browser.scene_page import (
     TIMEOUT_MS,
     ScenePage,
 )
-from support.browser.small_pictures import place_pictures
+from support.browser.small_pictures import README_PICTURES, place_pictures
 from support.waiting import LIMIT_S, until
 
 from app.benchmarks.browser import find_chromium
@@ -43,8 +43,6 @@ _VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
 _STILL: Literal["reduce"] = "reduce"
 """What moves for decoration alone is drawn sixty times a second, by software; a test that is about
 motion asks for it."""
-_PICTURES = "PHYSHANDI_PICTURES"
-"""Names the folder of the README's pictures, which are made anew if it is set (`make pictures`)."""
 _SETTLE_MS = 2_000
 """Time that software rendering takes to catch up with the scene."""
 _REPORT_VIOLATIONS = (
@@ -112,8 +110,7 @@ def _serving(folder: Path) -> Iterator[Served]:
     # Users start it where they work, and often have a package of this name there.
     (folder / "app").mkdir()
     (folder / "app" / "__init__.py").write_text("raise SystemExit('a package of the user')")
-    if not os.environ.get(_PICTURES):
-        place_pictures(folder / "data")
+    place_pictures(folder / "data")
     options = ["--port", "0", "--data-dir", "data", "--root-path", BELOW]
     options += ["--read-only-token-file", "read_only"]
     command = [sys.executable, "-P", "-c", START, "serve", *options]
@@ -177,7 +174,7 @@ def browser(playwright_driver: Playwright) -> Iterator[Browser]:
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
     browser = playwright_driver.chromium.launch(
         executable_path=executable,
-        args=_CHROMIUM + ([] if os.environ.get(_PICTURES) else [*LESS_WORK]),
+        args=_CHROMIUM + ([] if os.environ.get(README_PICTURES) else [*LESS_WORK]),
         timeout=TIMEOUT_MS,
     )
     yield browser
@@ -189,7 +186,7 @@ def _complaints_in(context: BrowserContext) -> list[str]:
     complaints: list[str] = []
     context.set_default_timeout(TIMEOUT_MS)
     context.add_init_script(_REPORT_VIOLATIONS + FEWER_PICTURES)
-    if not os.environ.get(_PICTURES):
+    if not os.environ.get(README_PICTURES):
         context.add_init_script(COARSER_PICTURES)
     context.on(
         "console",
@@ -305,7 +302,7 @@ def picture() -> Callable[[Page, str], None]:
 
     Tests call it where they have just shown that the page is what the picture claims.
     """
-    folder = os.environ.get(_PICTURES, "")
+    folder = os.environ.get(README_PICTURES, "")
 
     def keep(page: Page, name: str) -> None:
         if not folder:

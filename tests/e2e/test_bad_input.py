@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 from support.browser.scene_page import TIMEOUT_MS
+from support.browser.small_pictures import place_pictures
 from support.hostile.bad_input_world import fields, truncated
 from support.inputs.sheet_sequence import write_sheet
 
@@ -23,6 +24,7 @@ def page(browser: Browser, served) -> Iterator[Page]:
     torn = served.data_dir / "runs/torn"
     shutil.copytree(BUNDLED_RUN, torn)
     truncated(f"attempts/1/out/{ROLLOUT}")(torn)
+    place_pictures(served.data_dir)
     context = browser.new_context(reduced_motion="reduce")
     context.set_default_timeout(TIMEOUT_MS)
     defects: list[str] = []

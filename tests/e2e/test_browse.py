@@ -10,6 +10,7 @@ import pytest
 from playwright.sync_api import Page, Route, expect
 from support.browser.accessibility import COLOR_RULES, violations
 from support.browser.scene_page import TIMEOUT_MS
+from support.browser.small_pictures import place_pictures
 from support.inputs.clicked_disc import HEIGHT, TOP, WIDTH, cameras, center, write_disc
 from support.inputs.raw_capture import RawCapture
 from support.inputs.sheet_sequence import write_sheet
@@ -24,19 +25,19 @@ _SCENE = re.compile("/viewer/")
 RUN_COUNT = len(NAMES) + len(list(BUNDLED.glob("runs/*/run.yaml")))
 
 
-@pytest.fixture
-def base(home: Page, served) -> str:
+@pytest.fixture(scope="module")
+def base(served) -> str:
     """The server's address; two copies of the bundled run lie in its data folder."""
     source = BUNDLED / "runs" / "towel_fold_quick"
     for number, name in enumerate(NAMES):
         folder = served.data_dir / "runs" / f"copy{number}"
-        if not folder.exists():
-            shutil.copytree(source, folder)
-            job, about = folder / "job.yaml", folder / "run.yaml"
-            job.write_text(job.read_text().replace("../../towel_fold", str(BUNDLED / "towel_fold")))
-            about.write_text(about.read_text().replace("Towel fold, fitted", name))
+        shutil.copytree(source, folder)
+        job, about = folder / "job.yaml", folder / "run.yaml"
+        job.write_text(job.read_text().replace("../../towel_fold", str(BUNDLED / "towel_fold")))
+        about.write_text(about.read_text().replace("Towel fold, fitted", name))
     parameters = served.data_dir / "runs" / "copy1" / "attempts/1/out/object/parameters.yaml"
     parameters.write_text(re.sub(r"(?m)^drag: .*", "drag: 1.25", parameters.read_text()))
+    place_pictures(served.data_dir)
     return served.base
 
 
@@ -174,6 +175,7 @@ def test_a_damaged_run_is_told_and_moved_aside(home: Page, base: str, served) ->
     bad = served.data_dir / "runs" / "bad"
     shutil.copytree(served.data_dir / "runs" / "copy0", bad)
     (bad / "run.yaml").write_text((bad / "run.yaml").read_text() + "label: [1, 2]\n")
+    place_pictures(served.data_dir)
     home.goto(f"{base}/runs")
     row = home.locator("tr[data-run=bad]")
     expect(row.locator(".state")).to_have_text("damaged")

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
-from support.browser.scene_page import ScenePage
+from support.browser.scene_page import ScenePage, scaled_pictures
+from support.browser.small_pictures import place_pictures
 
 from app.settings import BUNDLED
 from physhandi.run import Run
@@ -40,6 +41,7 @@ def lifted(served) -> str:
         share = np.linspace(0.0, 1.0, len(rollout), dtype=np.float32)[:, None, None]
         attempt.save_array(at, rollout + share * LIFT)
         attempt.publish()
+    place_pictures(served.data_dir)
     return run.id
 
 
@@ -47,6 +49,7 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) ->
     home.goto(home.url.split("?")[0].rstrip("/") + "/runs")
     for run in ("towel_fold_quick", lifted):
         home.locator(f"tr[data-run={run}] [data-choose]").check()
+    home.add_init_script(scaled_pictures(1.0))  # Both sides have room beside the panel.
     home.locator("[data-chosen-scene]").click()
     home.wait_for_url("**/compare?**")
     scene = ScenePage(home)

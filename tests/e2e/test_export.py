@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect
-from support.browser.scene_page import FEWER_PICTURES, TIMEOUT_MS, ScenePage
+from support.browser.scene_page import FEWER_PICTURES, TIMEOUT_MS, ScenePage, scaled_pictures
 from support.viewer.gltf_player import Player
 
 pytestmark = pytest.mark.e2e
@@ -52,6 +52,8 @@ def test_a_link_opens_a_scene_whose_files_agree_with_the_server_s(
     home: Page, base: str, context: BrowserContext, tmp_path: Path
 ) -> None:
     context.grant_permissions(["clipboard-read", "clipboard-write"])
+    # Of few pixels, a disk is more or less than it should be, and differently so for each painter.
+    home.add_init_script(scaled_pictures(1.0))
     home.goto(f"{base}/runs/towel_fold_quick/view?{LINK}")
     scene = ScenePage(home)
     scene.new_difference("the simulation of the link")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 from support.browser.scene_page import ScenePage
+from support.browser.small_pictures import place_pictures
 from support.viewer.viewer_world import FolderCatalog
 
 from app.benchmarks.splats import scattered
@@ -204,6 +205,7 @@ def seen(served) -> Run:
         shutil.copytree(bundled.out, attempt.out, dirs_exist_ok=True)
         attempt.save_tensors(SPLATS_FILE, splats.to_tensors())
         attempt.publish()
+    place_pictures(served.data_dir)
     return run
 
 

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, Page, Request, expect
 from support.browser.scene_page import FEWER_PICTURES, TIMEOUT_MS
+from support.browser.small_pictures import place_pictures
 
 from app.security import only_looks
 
@@ -78,6 +79,7 @@ def shown(served: Any) -> Iterator[None]:
         job.write_text(job.read_text().replace("../../towel_fold", str(BUNDLED / "towel_fold")))
         about.write_text(about.read_text().replace("Towel fold, fitted", name))
     (served.data_dir / "runs" / TORN / "run.yaml").write_text("[")
+    place_pictures(served.data_dir)
     yield
     for name in (RUN, TORN):
         shutil.rmtree(served.data_dir / "runs" / name)

@@ -12,6 +12,7 @@ from pathlib import Path
 from urllib.parse import urljoin, urlsplit
 
 import pytest
+from support.browser.small_pictures import place_pictures
 from support.waiting import LIMIT_S
 
 pytestmark = pytest.mark.e2e
@@ -21,6 +22,7 @@ START = "from app.cli import main; main()"
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     (tmp_path / "elsewhere").mkdir()
+    place_pictures(tmp_path / "data")
     command = [sys.executable, "-c", START, "serve", "--port", "0", "--data-dir", "../data"]
     with (tmp_path / "log").open("w") as log:
         process = subprocess.Popen(
