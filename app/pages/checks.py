@@ -15,7 +15,7 @@ from app.jobs.checks import check_item
 from app.jobs.recordings.models import ModelFolders
 from app.pages.render import Pages
 from app.previews.overlay import LAYERS, draw_frame
-from physhandi.data.files import named_fields
+from physhandi.data.files import named_fields, with_status
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.fitting.checks.readiness import ABOUT, readiness
@@ -159,7 +159,6 @@ def _opened(folder: Path, _version: str) -> Sequence:
 
 def _version(folder: Path) -> str:
     """Name the state of a recording's files; another one when files come, go or are replaced."""
-    times = [folder.stat().st_mtime_ns, *(p.stat().st_mtime_ns for p in folder.glob("*.*"))]
-    for view in folder.glob("views/*/"):
-        times += [view.stat().st_mtime_ns, *(part.stat().st_mtime_ns for part in view.iterdir())]
+    parts = (*folder.glob("*.*"), *folder.glob("views/*/"), *folder.glob("views/*/*"))
+    times = [folder.stat().st_mtime_ns, *(status.st_mtime_ns for _, status in with_status(parts))]
     return f"{max(times):x}-{len(times)}"

@@ -45,21 +45,27 @@ def is_abandoned(path: Path) -> bool:
     return int(fields[1]) != os.getpid() and not psutil.pid_exists(int(fields[1]))
 
 
+def with_status(paths: Iterable[Path]) -> Iterator[tuple[Path, os.stat_result]]:
+    """Give paths with their status, passing over what was removed since it was listed."""
+    for path in paths:
+        try:
+            status = path.stat()
+        except OSError:
+            continue
+        yield path, status
+
+
 def files_by_age(paths: Iterable[Path]) -> list[tuple[float, int, Path]]:
     """List files, the oldest first, passing over what was removed since it was listed.
 
     Returns:
         Of each when it changed last [s since 1970], its size [B] and its path.
     """
-    files = list[tuple[float, int, Path]]()
-    for path in paths:
-        try:
-            status = path.stat()
-        except OSError:
-            continue
-        if S_ISREG(status.st_mode):
-            files.append((status.st_mtime, status.st_size, path))
-    return sorted(files)
+    return sorted(
+        (status.st_mtime, status.st_size, path)
+        for path, status in with_status(paths)
+        if S_ISREG(status.st_mode)
+    )
 
 
 def sweep_temporary(paths: Iterator[Path]) -> int:

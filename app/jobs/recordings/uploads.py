@@ -21,7 +21,7 @@ from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
 from app.jobs.recordings.upload_names import check_names, is_left_out, quoted_name
 from app.jobs.storage.room import NoRoomError, Room
 from app.settings import ServerSettings
-from physhandi.data.files import files_by_age, write_json
+from physhandi.data.files import files_by_age, with_status, write_json
 from physhandi.data.run_folder import Text, WholeNumber, checked, read_json
 from physhandi.errors import RunError, UsageError
 
@@ -269,11 +269,8 @@ class Uploads:
         uploads = list[tuple[str, Path, float]]()
         for path in sorted(self._folder.iterdir()):
             if self._tasks.task("upload", path.name).state != "running":
-                times = list[float]()
-                for one in (path, *path.rglob("*")):
-                    with suppress(FileNotFoundError):  # It was removed since it was listed.
-                        times.append(one.stat().st_mtime)
-                if times:
+                parts = with_status((path, *path.rglob("*")))
+                if times := [status.st_mtime for _, status in parts]:
                     uploads.append((path.name, path, max(times)))
         return uploads
 

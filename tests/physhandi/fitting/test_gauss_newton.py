@@ -333,6 +333,6 @@ def test_a_dozen_steps_come_nearer_than_hundreds_of_updates_of_gradient_descent(
     # Steps are counted as they are made, and in the end there are no more.
     count = len(steps.curve)
     assert told == [*((number, 40) for number in range(1, count)), (count, count)]
-    descent = reconstruct_hands(sequence, HandFitConfig(gauss_newton=False, iterations=200))
+    descent = reconstruct_hands(sequence, HandFitConfig(gauss_newton=False, iterations=300))
     assert steps.loss_after < descent.loss_after
     assert steps.curve[-1][0] == len(steps.curve) < 30
