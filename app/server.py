@@ -288,10 +288,17 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
         if request.url.path.startswith(("/runs/", "/live/")):
             return answer(request, 404, "not_found", _NOWHERE)
         fields = [
-            {"field": ".".join(map(str, entry["loc"])), "message": str(entry["msg"])}
+            {
+                "field": ".".join(map(str, entry["loc"])),
+                "message": str(entry["msg"]).removeprefix("Value error, "),
+            }
             for entry in error.errors()
         ]
-        first = f"{fields[0]['field']}: {fields[0]['message']}"
+        # What several fields say together has no field of its own.
+        is_of_all = error.errors()[0]["type"] == "value_error" and "." not in fields[0]["field"]
+        first = (
+            fields[0]["message"] if is_of_all else f"{fields[0]['field']}: {fields[0]['message']}"
+        )
         part, _, name = fields[0]["field"].partition(".")
         if part == "query" and error.errors()[0]["type"] == "missing":
             first = f"The address lacks “{name}=…”. It may have been cut off."

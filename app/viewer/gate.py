@@ -3,6 +3,7 @@
 import asyncio
 import json
 import logging
+import re
 from collections import Counter
 from collections.abc import Coroutine
 from typing import Any
@@ -30,6 +31,7 @@ _GONE = (
 )
 _MOST_REFUSED = 20
 """So many messages that are none, and the page that sends them is hung up on."""
+_PIXEL_RATIO = re.compile(r"[0-9]{1,2}(\.[0-9]{1,20})?")
 _LEAVING_S = 1.2
 """Time that the page that a tab has left may take to disconnect [s]."""
 
@@ -77,6 +79,7 @@ def create_gate(sessions: Sessions) -> APIRouter:
             await _refuse(websocket, 404, _GONE)
             return
         watching[session_id] += 1
+        session.pixel_ratio = _pixel_ratio(websocket)
         upstream: ClientConnection | None = None
         try:
             upstream = await _connect(websocket, session.port)
@@ -180,6 +183,12 @@ async def _connect(websocket: WebSocket, port: int) -> ClientConnection | None:
         await upstream.close()
         return None
     return upstream
+
+
+def _pixel_ratio(websocket: WebSocket) -> float:
+    """Read what the page's script says of the screen; 1 if that makes no sense."""
+    told = _PIXEL_RATIO.fullmatch(websocket.cookies.get("pixel_ratio", ""))
+    return min(max(float(told[0]), 0.25), 8.0) if told else 1.0
 
 
 async def _is_taken(watching: Counter[str], session_id: str) -> bool:

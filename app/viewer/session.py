@@ -243,6 +243,7 @@ class Session(SceneServer):
                 self.id,
                 newest=self._newest,
                 redraw=self._playback.redraw,
+                pixel_ratio=lambda: self.pixel_ratio,
             )
         with tabs["Look"]:
             self._colors = ColorPanel(

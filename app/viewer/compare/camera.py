@@ -1,5 +1,6 @@
 """Cameras while two sides are shown beside each other, and their way back."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,8 @@ from physhandi.rotations import unit
 
 PICTURE_WIDTH = 1_600
 """Width of an exported picture of both sides [px]."""
-_PANEL_PIXELS = 345
+_PANEL_WIDTH = 345
+"""Width that the panel covers, in pixels of the page."""
 _FOV = float(np.deg2rad(14.0))
 _SAME_FOV = 1e-3
 """Fields of view that differ by less are the same [rad]."""
@@ -65,7 +67,14 @@ class _Aim:
 class ComparisonCameras:
     """Moves the cameras of the clients to both sides and back."""
 
-    def __init__(self) -> None:
+    def __init__(self, pixel_ratio: Callable[[], float]) -> None:
+        """Begin with no client.
+
+        Args:
+            pixel_ratio: Gives how many pixels in a row the screen has for each of the page; those
+                of the screen are what viser says the size of a picture in.
+        """
+        self._pixel_ratio = pixel_ratio
         self._poses: dict[int, Pose] = {}
         self._aims: dict[int, _Aim] = {}
 
@@ -88,7 +97,7 @@ class ComparisonCameras:
         self._poses.setdefault(client.client_id, pose)
         eye = Eye.at(pose)
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
-        hidden = _covered(width)
+        hidden = self._covered(width)
         slope = float(np.tan(_FOV / 2))
         center, wide, high = box
         distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
@@ -141,37 +150,36 @@ class ComparisonCameras:
         self._poses.clear()
         self._aims.clear()
 
+    def picture(self, client: viser.ClientHandle, box: Box) -> dict[str, Any]:
+        """Find camera and size of a picture of both sides as a client sees it beside the panel.
 
-def picture_of_both(client: viser.ClientHandle, box: Box) -> dict[str, Any]:
-    """Find camera and size of a picture of both sides as a client sees it beside the panel.
+        What is empty above and below is cut off evenly, so that the middle stays.
 
-    What is empty above and below is cut off evenly, so that the middle stays.
+        Args:
+            client: Who looks.
+            box: Both sides as they are seen.
 
-    Args:
-        client: Who looks.
-        box: Both sides as they are seen.
+        Returns:
+            Arguments of viser's ``get_render``.
+        """
+        camera = client.camera
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        hidden = self._covered(width)
+        pixel = 2 * np.tan(camera.fov / 2) / height
+        distance = float(np.linalg.norm(camera.look_at - camera.position))
+        eye = Eye.of(camera.wxyz)
+        aside = 0.5 * hidden * pixel * distance * eye.right
+        reach = abs(float((box[0] - camera.look_at) @ eye.up)) + 0.5 * box[2]
+        shown_height = min(2 * reach / (pixel * distance), height)
+        return {
+            "width": PICTURE_WIDTH,
+            "height": max(round(shown_height * PICTURE_WIDTH / (width - hidden)), 1),
+            "wxyz": camera.wxyz,
+            "position": camera.position - aside,
+            "fov": 2 * float(np.arctan(np.tan(camera.fov / 2) * shown_height / height)),
+        }
 
-    Returns:
-        Arguments of viser's ``get_render``.
-    """
-    camera = client.camera
-    width, height = max(camera.image_width, 1), max(camera.image_height, 1)
-    hidden = _covered(width)
-    pixel = 2 * np.tan(camera.fov / 2) / height
-    distance = float(np.linalg.norm(camera.look_at - camera.position))
-    eye = Eye.of(camera.wxyz)
-    aside = 0.5 * hidden * pixel * distance * eye.right
-    reach = abs(float((box[0] - camera.look_at) @ eye.up)) + 0.5 * box[2]
-    shown_height = min(2 * reach / (pixel * distance), height)
-    return {
-        "width": PICTURE_WIDTH,
-        "height": max(round(shown_height * PICTURE_WIDTH / (width - hidden)), 1),
-        "wxyz": camera.wxyz,
-        "position": camera.position - aside,
-        "fov": 2 * float(np.arctan(np.tan(camera.fov / 2) * shown_height / height)),
-    }
-
-
-def _covered(width: int) -> int:
-    """Guess how many pixels of a picture the panel covers."""
-    return _PANEL_PIXELS if width > 2 * _PANEL_PIXELS else 0
+    def _covered(self, width: int) -> float:
+        """Guess how many pixels of a picture the panel covers."""
+        panel = _PANEL_WIDTH * self._pixel_ratio()
+        return panel if width > 2 * panel else 0.0

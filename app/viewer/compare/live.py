@@ -49,6 +49,7 @@ class LiveComparison:
         *,
         newest: Callable[[], ObjectRollout | None],
         redraw: Callable[[], None],
+        pixel_ratio: Callable[[], float],
     ) -> None:
         """Add the buttons, hidden until there is an object.
 
@@ -59,6 +60,7 @@ class LiveComparison:
             session: Id of the session.
             newest: Gives the rollout that was asked for last, as far as it is there.
             redraw: Draws the current frame again.
+            pixel_ratio: Gives the pixels of the screen for each of the page.
         """
         self._server = server
         self._guard = guard
@@ -67,7 +69,7 @@ class LiveComparison:
         self._newest = newest
         self._redraw = redraw
         self._lock = threading.RLock()
-        self._cameras = ComparisonCameras()
+        self._cameras = ComparisonCameras(pixel_ratio)
         self._content: Content | None = None
         self._framing: Framing | None = None
         self._run: Path | None = None

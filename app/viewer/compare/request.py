@@ -37,7 +37,7 @@ class CompareAsk(BaseModel):
         if self.a == self.b:
             raise ValueError(
                 f"A and B are both run '{self.a}'; to compare two parameter sets of one run, open "
-                "it and pin one of them"
+                "it and keep one of them as A."
             )
         return self
 
@@ -58,7 +58,8 @@ class CompareAsk(BaseModel):
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(map(str, first["loc"])) or "a, b"
-            raise UsageError(f"{place}: {first['msg']}") from None
+            message = first["msg"].removeprefix("Value error, ")
+            raise UsageError(f"{place}: {message}") from None
 
 
 class NewComparison(CompareAsk):

@@ -54,7 +54,7 @@ class CompareSession(SceneServer):
         self._ask = CompareAsk.parse(target)
         self._pair = open_pair(catalog, self._ask)
         self._has_played = False
-        self._cameras = ComparisonCameras()
+        self._cameras = ComparisonCameras(lambda: self.pixel_ratio)
         super().__init__(session_id, owner=owner, title=self._pair.title)
         clock = self._pair.clock
         self._playback = Playback(clock.tick_count, clock.rate, self._draw)

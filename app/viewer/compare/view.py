@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from app.viewer.compare.camera import ComparisonCameras, Eye, picture_of_both
+from app.viewer.compare.camera import ComparisonCameras, Eye
 from app.viewer.compare.curve import DifferenceCurve, Pairing
 from app.viewer.compare.drawing import CompareDrawing, Look
 from app.viewer.compare.panel import ComparePanel
@@ -107,7 +107,7 @@ class CompareView:
         return self._picture if self.look.mode == "side" else None
 
     def _picture(self, client: viser.ClientHandle) -> dict[str, Any]:
-        return picture_of_both(client, self.drawing.box(Eye.of(client.camera.wxyz)))
+        return self._cameras.picture(client, self.drawing.box(Eye.of(client.camera.wxyz)))
 
     def _aim(self, client: viser.ClientHandle, pose: Pose) -> None:
         eye = Eye.at(pose)

@@ -84,6 +84,8 @@ class SceneServer(ABC):
         self.id = session_id
         self.owner = owner
         self.created = time.time()
+        self.pixel_ratio = 1.0
+        """Pixels of the screen for each of the page, in a row, as the tab told last."""
         self._seen = time.monotonic()
         self._is_closed = False
         self._closing = threading.Lock()

@@ -96,7 +96,14 @@ def test_a_wrong_address_names_the_field(
     for address in ("/compare", "/api/v1/comparison"):
         answer = still_pair.script().get(f"{address}?{query}")
         assert answer.status_code == status
-        assert word in answer.json()["error"]["message"]
+        message = answer.json()["error"]["message"]
+        assert word in message
+        assert "Value error" not in message
+
+
+def test_two_sides_that_are_the_same_are_told_in_plain_words(still_pair: World) -> None:
+    answer = still_pair.script().get("/compare?a=fitted&b=fitted")
+    assert answer.json()["error"]["message"].startswith("A and B are both run 'fitted'; ")
 
 
 def test_a_damaged_run_is_told(world: World, pair: tuple[str, str]) -> None:

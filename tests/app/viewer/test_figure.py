@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +21,11 @@ from support.viewer.viewer_world import (
 )
 
 from app.exports.permalink import state_from_query
-from app.viewer.compare.camera import Eye, picture_of_both
+from app.viewer.compare.camera import ComparisonCameras, Eye
 from app.viewer.compare.drawing import ARROWS, CompareDrawing, Look, legend_force
 from app.viewer.compare.sides import ComparedSide
 from app.viewer.content.layers import Layers
+from app.viewer.content.session_state import Pose
 from app.viewer.export.snapshot import Snapshot, snapshot_csv, snapshot_npz
 from app.viewer.scene.framing import frame_content
 from app.viewer.session import Session
@@ -300,7 +302,7 @@ def test_a_picture_is_centered_on_what_is_seen_beside_the_panel(server_client) -
     (seen,) = (c for c in server.get_clients().values())
     camera = seen.camera
     box = (np.zeros(3), 0.4, 0.1)
-    view = picture_of_both(seen, box)
+    view = ComparisonCameras(lambda: 1.0).picture(seen, box)
     # 640 pixels are too few for the panel to be taken into account: all of the width is kept.
     assert (view["width"], view["position"].tolist()) == (1600, camera.position.tolist())
     camera_high = 2 * np.tan(0.4) * np.sqrt(3)
@@ -309,6 +311,28 @@ def test_a_picture_is_centered_on_what_is_seen_beside_the_panel(server_client) -
     assert view["height"] == pytest.approx(1600 * 480 / 640 * 2 * reach / camera_high, abs=1)
     kept = np.tan(view["fov"] / 2) / np.tan(0.4)
     assert kept == pytest.approx(view["height"] / 1200, abs=1e-3)
+
+
+def test_the_panel_covers_more_pixels_of_a_sharper_screen(server_client) -> None:
+    server, client = server_client
+    box, views = (np.zeros(3), 0.4, 0.1), list[dict[str, Any]]()
+    (seen,) = server.get_clients().values()
+    pose = Pose.of(seen.camera)
+    for ratio in (1, 2):
+        width, height = 1280 * ratio, 720 * ratio
+        client.tell_camera(image_width=width, image_height=height)
+        client.until(lambda width=width: seen.camera.image_width == width)
+        cameras = ComparisonCameras(lambda ratio=ratio: ratio)
+        cameras.aim(seen, pose, box)
+        views.append(cameras.picture(seen, box) | {"stands": seen.camera.position})
+    one, two = views
+    for name in ("position", "stands", "width", "height", "fov"):
+        assert two[name] == pytest.approx(one[name], rel=1e-9)
+    # The middle of both sides is left of the picture's, by half of the panel's 345 pixels.
+    eye = Eye.at(pose)
+    aside = (one["stands"] - one["position"]) @ eye.right
+    distance = (seen.camera.look_at - one["stands"]) @ eye.ahead
+    assert aside / distance / (2 * np.tan(np.deg2rad(14) / 2)) * 720 == pytest.approx(345 / 2)
 
 
 def test_the_force_of_the_legend_is_round() -> None:

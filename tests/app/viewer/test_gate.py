@@ -199,6 +199,29 @@ def test_another_browser_finds_nothing(address, sessions) -> None:
             assert refused.value.response.status_code == 404
 
 
+@pytest.mark.parametrize(
+    ("cookie", "ratio"),
+    [
+        ("pixel_ratio=2", 2.0),
+        ("other=7; pixel_ratio=1.5625", 1.5625),
+        ("pixel_ratio=50", 8.0),
+        ("pixel_ratio=0", 0.25),
+        ("pixel_ratio=1e9", 1.0),
+        ("", 1.0),
+    ],
+)
+def test_a_page_tells_how_sharp_its_screen_is(
+    address, sessions: Sessions, cookie: str, ratio: float
+) -> None:
+    session = sessions.open("run", "sheet", "me")
+    headers = {"Cookie": cookie} if cookie else {}
+    with ViewerClient(f"ws://{address}/viewer/{session}", additional_headers=headers) as client:
+        client.until(lambda: client.nodes)
+        live = sessions.get(session)
+        assert live is not None
+        assert live.pixel_ratio == ratio
+
+
 def first_positions(client: ViewerClient) -> list[tuple[float, ...]]:
     """Where the server wants the camera to be, in the order in which it told."""
     return [m["position"] for m in client.messages if m["type"] == "SetCameraPositionMessage"]
