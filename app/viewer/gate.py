@@ -187,8 +187,8 @@ async def _connect(websocket: WebSocket, port: int) -> ClientConnection | None:
 
 def _pixel_ratio(websocket: WebSocket) -> float:
     """Read what the page's script says of the screen; 1 if that makes no sense."""
-    told = _PIXEL_RATIO.fullmatch(websocket.cookies.get("pixel_ratio", ""))
-    return min(max(float(told[0]), 0.25), 8.0) if told else 1.0
+    match = _PIXEL_RATIO.fullmatch(websocket.cookies.get("pixel_ratio", ""))
+    return min(max(float(match[0]), 0.25), 8.0) if match else 1.0
 
 
 async def _is_taken(watching: Counter[str], session_id: str) -> bool:
