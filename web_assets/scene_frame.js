@@ -17,7 +17,7 @@
   const isRecording = Boolean(window.__VISER_EMBED_CONFIG__) || new URLSearchParams(location.search).has("playbackPath");
 
   /* Side B of a comparison stands beside the panel, whose width on the screen the server cannot know. */
-  if (!isRecording) document.cookie = `pixel_ratio=${window.devicePixelRatio}; path=/; samesite=strict`;
+  if (!isRecording) document.cookie = `pixel_ratio=${window.devicePixelRatio}; path=${location.pathname.replace(/[^/]*\/$/, "")}; samesite=strict`;
 
   function meshOf(group, count) {
     let found = null;
