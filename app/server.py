@@ -53,6 +53,7 @@ from app.viewer.physics.edit_presets import EditPresetStore
 from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
 from app.viewer.sessions import Sessions, TooManySessionsError
+from app.wrong_fields import wrong_fields
 from physhandi import __version__
 from physhandi.errors import (
     MissingInputError,
@@ -287,27 +288,24 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
     def on_invalid(request: Request, error: RequestValidationError) -> Response:
         if request.url.path.startswith(("/runs/", "/live/")):
             return answer(request, 404, "not_found", _NOWHERE)
-        fields = [
-            {
-                "field": ".".join(map(str, entry["loc"])),
-                "message": str(entry["msg"]).removeprefix("Value error, "),
-            }
-            for entry in error.errors()
-        ]
-        # What several fields say together has no field of its own.
-        is_of_all = error.errors()[0]["type"] == "value_error" and "." not in fields[0]["field"]
-        first = (
-            fields[0]["message"] if is_of_all else f"{fields[0]['field']}: {fields[0]['message']}"
-        )
-        part, _, name = fields[0]["field"].partition(".")
-        if part == "query" and error.errors()[0]["type"] == "missing":
-            first = f"The address lacks “{name}=…”. It may have been cut off."
+        wrong = wrong_fields(error.errors())
+        first = _first_reason(*wrong[0], error.errors()[0]["type"])
+        fields = [{"field": field, "message": message} for field, message in wrong]
         return answer(request, 422, "invalid", first, fields)
 
     @app.exception_handler(Exception)
     def on_defect(request: Request, error: Exception) -> Response:
         logger.error("a request failed: %s", request.url.path, exc_info=error)
         return answer(request, 500, "defect", "The server made a mistake; its log tells more.")
+
+
+def _first_reason(place: str, why: str, kind: str) -> str:
+    """Say what is wrong with a part of a request."""
+    part, _, name = place.partition(".")
+    if part == "query" and kind == "missing":
+        return f"The address lacks “{name}=…”. It may have been cut off."
+    # Several fields that are wrong together have no name.
+    return f"{place}: {why}" if name or kind != "value_error" else why
 
 
 def _status_of(error: PhysHandiError | OSError) -> tuple[int, str]:

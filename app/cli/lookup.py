@@ -7,6 +7,7 @@ from pydantic import ValidationError
 
 from app.jobs.catalog import Catalog, UnknownRunError, UnknownSequenceError
 from app.settings import ServerSettings
+from app.wrong_fields import wrong_fields
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
@@ -21,9 +22,8 @@ def read_settings(**given: Any) -> ServerSettings:
     try:
         return ServerSettings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "settings"
-        raise UsageError(f"{where}: {first['msg']}.") from None
+        where, why = wrong_fields(error.errors())[0]
+        raise UsageError(f"{where or 'settings'}: {why}.") from None
 
 
 def cluster_settings(settings: ServerSettings, device: str) -> ServerSettings:

@@ -28,6 +28,7 @@ from app.ids import ItemId
 from app.jobs.catalog import Catalog, NotFoundError
 from app.root_path import address_on
 from app.security import SHARED, bare_page
+from app.wrong_fields import wrong_fields
 from physhandi.data.files import temporary_name, write_json
 from physhandi.data.run_folder import read_json
 from physhandi.errors import RunError, UsageError, describe
@@ -168,9 +169,8 @@ class Shares:
             about = StoredShare.model_validate(read_json(path))
             size = (folder / _PAGE).stat().st_size
         except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(str(part) for part in first["loc"])
-            raise RunError(f"{path} is damaged: {field}: {first['msg']}.") from None
+            field, why = wrong_fields(error.errors())[0]
+            raise RunError(f"{path} is damaged: {field}: {why}.") from None
         except OSError as error:
             raise RunError(describe(error)) from None
         return Share(id=folder.name, url=f"{SHARED}{folder.name}", bytes=size, **about.model_dump())

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.jobs.catalog import NotFoundError
 from app.pages.metrics import about_quantity, figure, scaled, unit_of_metric
 from app.pages.render import Pages
+from app.wrong_fields import wrong_fields
 from physhandi.data.files import files_by_age
 from physhandi.data.run_folder import read_json
 from physhandi.errors import PhysHandiError, RunError
@@ -193,10 +194,9 @@ def _read(path: Path) -> StoredCells:
     try:
         return StoredCells.model_validate(read_json(file))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
+        where, why = wrong_fields(error.errors())[0]
         raise RunError(
-            f"{file} is damaged: {where}: {first['msg']}. Delete it, and evaluate the suite again; "
+            f"{file} is damaged: {where}: {why}. Delete it, and evaluate the suite again; "
             "finished cells are kept."
         ) from None
 

@@ -6,6 +6,7 @@ from urllib.parse import parse_qsl, urlencode
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from app.ids import ItemId
+from app.wrong_fields import wrong_fields
 from physhandi.errors import UsageError
 
 Mode = Literal["side", "overlay", "wipe"]
@@ -56,10 +57,8 @@ class CompareAsk(BaseModel):
         try:
             return cls.model_validate(dict(parse_qsl(query, keep_blank_values=True)))
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(map(str, first["loc"])) or "a, b"
-            message = first["msg"].removeprefix("Value error, ")
-            raise UsageError(f"{place}: {message}") from None
+            place, why = wrong_fields(error.errors())[0]
+            raise UsageError(f"{place or 'a, b'}: {why}") from None
 
 
 class NewComparison(CompareAsk):

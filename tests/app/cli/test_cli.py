@@ -16,10 +16,12 @@ from support.server.server_world import tiny_config
 
 from app import cli
 from app.cli import runs
+from app.cli.lookup import read_settings
 from app.settings import BUNDLED
 from physhandi import pipeline
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
+from physhandi.errors import UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
@@ -515,3 +517,9 @@ def test_the_page_of_the_command_line_tells_what_the_commands_take() -> None:
     assert text == PAGE.read_text(encoding="utf-8"), "run tests/command_line_page.py"
     for name in ("`--connection-radius`", "`--set`", "### `physhandi import mocap`"):
         assert name in text
+
+
+def test_settings_that_do_not_go_together_are_told_in_plain_words(tmp_path: Path) -> None:
+    with pytest.raises(UsageError) as wrong:
+        read_settings(data_dir=tmp_path, token="a" * 40, token_file=tmp_path / "token")
+    assert str(wrong.value).startswith("settings: token and token_file are both set; ")
