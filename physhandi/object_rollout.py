@@ -135,13 +135,18 @@ class ObjectRollout:
         if not is_own and self._continued is None:
             self.model_in(frame)  # Finds it out.
         whole = self.model if is_own or self._continued is None else self._continued
-        position, velocity, _, _ = self.state(frame)
+        place, velocity, control, _ = self.state(frame)
         if frame == 0:
             velocity = self.model.initial_velocity if self.start is None else self.start[1]
-        return whole.held_in(frame + 1), (
-            np.array(position, np.float32),
-            np.array(velocity, np.float32),
+        position, velocity = (
+            np.array(each, np.float32) for each in (self.position[frame], velocity)
         )
+        if self._node_shift(frame) is not None:
+            # Springs are to have the strain here that they have beside.
+            seen = Restart(frame=frame, position=position, velocity=velocity)
+            lower = replace(whole, clearance=self.model.clearance)
+            whole = seen.continued(lower, self.parameters, place[None], control[None])
+        return whole.held_in(frame + 1), (position, velocity)
 
     def held_control(self, frame: int) -> Float[ndarray, "control 3"]:
         """Give where virtual springs end: after a restart that moves hands not where these are."""
@@ -159,10 +164,27 @@ class ObjectRollout:
             self.hand_shift = restart.hand_shift(self.model, own)
         return self.hand_shift
 
+    def sprung_nodes(self, frame: int) -> Float[ndarray, "node 3"]:
+        """Give where springs have the nodes: beside where they are seen after some restarts."""
+        position, shift = np.asarray(self.position[frame]), self._node_shift(frame)
+        return position if shift is None else position - shift
+
+    def _node_shift(self, frame: int) -> Float[ndarray, "node 3"] | None:
+        """Give what a restart has added to the nodes of a frame [m]; None for nothing."""
+        restart = self.restart
+        if restart is None or frame <= restart.frame:
+            return None
+        return restart.node_shift(np.asarray(self.position[restart.frame]))
+
     def _restart_before(self, frame: int) -> Restart | None:
         """Give the restart if the frame is the first one after it."""
         restart = self.restart
         return restart if restart is not None and frame == restart.frame + 1 else None
+
+    def _restarted(self, restart: Restart) -> Float[ndarray, "node 3"]:
+        """Give where springs have the nodes when it goes on from a restart [m]."""
+        own = np.asarray(self.position[restart.frame])
+        return own if restart.shifts_nodes else restart.position
 
     def _strained(self, restart: Restart) -> tuple[ndarray, ndarray]:
         """Give object and control nodes in the frames whose strain a restart keeps [m]."""
@@ -176,6 +198,7 @@ class ObjectRollout:
             ``restart_frame``, the last frame before it; ``restart_position`` and
             ``restart_velocity`` of the object nodes, from which the next frame starts [m, m/s];
             ``restart_hand_shift`` of every control node from then on [m], if hands are moved;
+            ``restart_node_shift`` [m], if springs have the nodes that far from where they are seen;
             ``restart_rest_length`` of every spring and ``restart_clearance`` of every node from
             then on [m]. Nothing if no frame that is ready comes after a restart.
         """
@@ -186,6 +209,9 @@ class ObjectRollout:
         shift = self.shift_of_hands()
         if shift is not None:
             state["restart_hand_shift"] = shift
+        beside = self._node_shift(self.restart.frame + 1)
+        if beside is not None:
+            state["restart_node_shift"] = beside
         return state | {
             "restart_rest_length": model.rest_length,
             "restart_clearance": model.clearance,
@@ -222,7 +248,7 @@ class ObjectRollout:
         """Compute the push at a moment on the way to a frame."""
         position, velocity, control, control_velocity = state
         before, restart = max(frame - 1, 0), self._restart_before(frame)
-        first = self.position[before] if restart is None else restart.position
+        first = self.sprung_nodes(before) if restart is None else self._restarted(restart)
         hand = control + (np.asarray(self.control[frame]) - self.held_control(frame))
         return push_forces(
             self.model_in(frame),
@@ -238,8 +264,8 @@ class ObjectRollout:
 
     def strains(self, frame: int) -> Float[ndarray, " spring"]:
         """Measure how much longer each spring is than at rest, as a part of its rest length."""
-        position, control = self.position[frame], self.held_control(frame)
-        return spring_strains(self.model_in(frame), np.asarray(position), control)
+        position, control = self.sprung_nodes(frame), self.held_control(frame)
+        return spring_strains(self.model_in(frame), position, control)
 
     def tensions(self, frame: int) -> Float[ndarray, " spring"]:
         """Compute how hard each spring pulls its ends together [N]."""
@@ -315,11 +341,14 @@ class ObjectRollout:
         return np.stack(means)
 
     def state(self, frame: int) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """Collect positions and velocities of object nodes, then of control nodes [m, m/s]."""
+        """Collect positions and velocities of object nodes, then of control nodes [m, m/s].
+
+        They are those that springs act with (`sprung_nodes`, `held_control`).
+        """
         given = self.velocity
         velocity = self._mean_velocity(frame) if given is None else given[frame]
         return (
-            np.asarray(self.position[frame]),
+            self.sprung_nodes(frame),
             np.asarray(velocity),
             self.held_control(frame),
             _difference(self.control, frame, self.parameters.frame_rate),

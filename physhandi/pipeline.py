@@ -397,7 +397,6 @@ def _store_restart(
             _followed(attempt, sequence, fitted.model.object_node, config.object_),
             sequence.reconstruction_frames[-1],
             device=device,
-            moves_hands=(attempt.out / SequenceFiles(sequence.name).contacts).is_file(),
             strain_time=config.prediction.strain_time,
         )
     except MissingInputError as error:

@@ -387,10 +387,10 @@ class PredictionConfig(Settings, frozen=True, kw_only=True):
     """How the frames after the fitted ones are simulated."""
 
     restarts: bool = False
-    """Whether they start from the observed state of the last fitted frame, with all strain kept,
-    instead of the rollout's own state. Off where a run's settings say nothing of it, as those of
-    older runs, which do not restart."""
-    strain_time: Annotated[float, Meta(ge=0.0, le=1e3)] = 0.5
+    """Whether they start from where the object was seen in the last fitted frame, with its strain
+    kept, instead of the rollout's own state. Off where a run's settings say nothing of it, as those
+    of older runs, which do not restart."""
+    strain_time: Annotated[float, Meta(ge=0.0, le=1e3)] = 1.0
     """Time until the last fitted frame over which the strain that springs keep is averaged; 0 keeps
     that of the frame alone [s]."""
 

@@ -5,6 +5,10 @@ lengths describe. With the rest length r of a spring of length L scaled to ``r' 
 L' is its length in the new state, its strain ``L' / r' - 1`` and with it its tension are what they
 were. Nodes that lie on the ground would fall, or slide off while they do, if they are seen a little
 higher; they lie on it where they are seen.
+
+But directions of springs are then others, and each spring that is a little turned throws its nodes.
+So springs may go on where the rollout has them, and every node is shown as far beside that as it
+was seen there: what a fit missed is a shift, not a force.
 """
 
 from collections.abc import Mapping
@@ -28,7 +32,7 @@ FIRM_HOLD = 4
 """Virtual springs that fix the place of a node, whatever hangs on it."""
 COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
-_OPTIONAL = {"moves_hands": 0, "eases_grips": 0, "strain_frames": 1}
+_OPTIONAL = {"moves_hands": 0, "eases_grips": 0, "strain_frames": 1, "shifts_nodes": 0}
 """Single numbers that a stored restart may lack, and what they are then."""
 
 NodeState = tuple[Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]
@@ -83,6 +87,10 @@ class Restart:
     strain_frames: int = 1
     """Frames, that of the restart and those before it, over which the strain that springs keep is
     averaged; 1 keeps that of the moment."""
+    shifts_nodes: bool = False
+    """Whether springs go on where the rollout has them, and every node is from then on as far
+    beside that as `position` is (`node_shift`). No spring is turned, so none throws its nodes.
+    (`moves_hands` and `eases_grips` are of older runs, which moved the nodes themselves.)"""
 
     def __post_init__(self) -> None:
         if self.frame < 0:
@@ -120,7 +128,8 @@ class Restart:
         A spring keeps its strain, or has none where grips are eased, unless its rest length would
         fall below its floor or below `SHORTEST_SHARE` of what it was. One whose ends coincide in
         the rollout has no strain to keep: its rest length stays. A node that lies on the ground in
-        the rollout has its height in the new state as its clearance from then on.
+        the rollout has its height in the new state as its clearance from then on. Of nodes
+        that are shifted it is that in the rollout.
 
         Args:
             model: The springs until then; virtual ones are changed as the object's own.
@@ -133,7 +142,8 @@ class Restart:
         own = position[-1]
         shift = self.hand_shift(model, own)
         moved = control[-1] if shift is None else control[-1] + shift
-        after = rest * (1.0 + spring_strains(model, self.position, moved))
+        start = own if self.shifts_nodes else self.position
+        after = rest * (1.0 + spring_strains(model, start, moved))
         scale = np.divide(after, before, out=np.ones_like(rest), where=before > COINCIDENT)
         floor = np.full_like(rest, parameters.virtual_rest_length_floor)
         floor[: model.object_spring_count] = parameters.rest_length_floor
@@ -148,7 +158,7 @@ class Restart:
         scaled = np.maximum(scaled, shortest).astype(np.float32)
         clearance = model.clearance
         if parameters.ground_height is not None:
-            height = np.maximum(self.position[:, 2] - parameters.ground_height, 0.0)
+            height = np.maximum(start[:, 2] - parameters.ground_height, 0.0)
             clearance = np.where(rests, height, clearance).astype(np.float32)
         return replace(model, rest_length=scaled, clearance=clearance)
 
@@ -192,6 +202,17 @@ class Restart:
         count = np.maximum(np.bincount(control, minlength=model.control_count), 1)
         return (np.stack(total, axis=1) / count[:, None]).astype(np.float32)
 
+    def node_shift(self, position: Float[ndarray, "node 3"]) -> Float32[ndarray, "node 3"] | None:
+        """Give how far nodes are from where springs have them, in the frames that follow [m].
+
+        Args:
+            position: The rollout's own nodes in the frame of the restart [m].
+
+        Returns:
+            The shifts; None if nodes are not shifted.
+        """
+        return self.position - np.asarray(position, np.float32) if self.shifts_nodes else None
+
     def to_tensors(self) -> dict[str, ndarray]:
         """Return every field as an array, ready for safetensors."""
         frame = np.array([self.frame], dtype=np.int32)
@@ -226,6 +247,7 @@ class Restart:
             moves_hands=bool(single["moves_hands"][0]),
             eases_grips=bool(single["eases_grips"][0]),
             strain_frames=int(single["strain_frames"][0]),
+            shifts_nodes=bool(single["shifts_nodes"][0]),
         )
 
 

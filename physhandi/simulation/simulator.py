@@ -166,7 +166,7 @@ class Simulator:
         restart: Restart,
         position: Float[ndarray, "strained node 3"],
         control: Float[ndarray, "strained control 3"],
-    ) -> Float32[ndarray, "control 3"] | None:
+    ) -> tuple[Float32[ndarray, "control 3"] | None, Float32[ndarray, "node 3"] | None]:
         """Replace the state by another one, in which every spring is strained as it was until now.
 
         Args:
@@ -175,20 +175,22 @@ class Simulator:
             control: Control nodes in them [m].
 
         Returns:
-            What to add to the control nodes from now on [m]; None for nothing.
+            What to add from now on to the control nodes, before they are given, and to the object
+            nodes, to have where they are seen [m]; None for nothing.
 
         Raises:
             ValueError: If it is a state of another number of nodes.
         """
         restart.check_nodes(self.model.node_count)
         model = restart.continued(self.model, self.parameters, position, control)
-        shift = restart.hand_shift(self.model, position[-1])
-        self.reset(restart.position, restart.velocity)
+        hand_shift = restart.hand_shift(self.model, position[-1])
+        node_shift = restart.node_shift(position[-1])
+        self.reset(restart.position if node_shift is None else position[-1], restart.velocity)
         self.rest_length.assign(model.rest_length)
         self.clearance.assign(model.clearance)
         if self.hand_contact is not None:
-            self.hand_contact.shift(shift)
-        return shift
+            self.hand_contact.shift(hand_shift)
+        return hand_shift, node_shift
 
     def step_frame(
         self,
@@ -253,19 +255,23 @@ class Simulator:
         if restart is not None:
             restart.check_nodes(self.model.node_count)
         self.reset(*(start or ()))
-        shift: ndarray | None = None
+        hand_shift: ndarray | None = None
+        node_shift: ndarray | None = None
         strained = range(0) if restart is None else restart.strained_frames
         own: list[ndarray] = []
         for frame in range(len(control)):
             if frame > 0:
                 way = control[frame - 1 : frame + 1]
-                self.step_frame(frame, *(way if shift is None else way + shift))
+                self.step_frame(frame, *(way if hand_shift is None else way + hand_shift))
             position = self.position.numpy().copy()
             if frame in strained:
                 own.append(position)
+            if node_shift is not None:
+                position += node_shift
             yield frame, position, self.velocity.numpy().copy()
             if restart is not None and frame == restart.frame:
-                shift = self.continue_from(restart, np.stack(own), control[strained])
+                strain = np.stack(own), control[strained]
+                hand_shift, node_shift = self.continue_from(restart, *strain)
 
     def rollout(
         self, control: Float[ndarray, "frame control 3"], restart: Restart | None = None

@@ -1,10 +1,11 @@
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 from support.physics.hanging_node import hanging_node
 from support.viewer.viewer_world import PARAMETERS, make_run
 
@@ -116,6 +117,64 @@ def test_every_simulation_of_the_sequence_restarts_with_the_strain_it_had(
     expected = spring_strains(later, rollout.position[AT + 1], rollout.control[AT + 1])
     np.testing.assert_array_equal(rollout.strains(AT + 1), expected)
     assert np.abs(plain.tensions(AT + 1) - rollout.tensions(AT + 1)).max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def shifted(restarted, tmp_path_factory) -> Run:
+    """The same, where springs go on beside where nodes are seen."""
+    folder = tmp_path_factory.mktemp("shifted") / "sheet"
+    shutil.copytree(restarted.folder, folder)
+    run = Run.open(folder)
+    path = run.out / SequenceFiles("lift").restart
+    state = Restart.from_tensors(load_file(path))
+    save_file(replace(state, shifts_nodes=True, strain_frames=3).to_tensors(), path)
+    return run
+
+
+def test_strain_and_force_are_those_of_springs_beside_the_nodes(run, shifted) -> None:
+    plain, rollout = (FittedObject.of(each, "lift").simulate() for each in (run, shifted))
+    assert rollout.restart is not None
+    own = rollout.position[AT]
+    np.testing.assert_array_equal(own, plain.position[AT])
+    shift = rollout.restart.position - own
+    assert np.linalg.norm(shift, axis=1).min() > 0.005
+    later = rollout.model_in(AT + 1)
+    beside = Simulator(later, rollout.parameters)
+    beside.reset(own, rollout.restart.velocity)
+    beside.step_frame(AT + 1, rollout.control[AT], rollout.control[AT + 1])
+    place = beside.position.numpy()
+    np.testing.assert_allclose(rollout.position[AT + 1], place + shift, atol=1e-7)
+    np.testing.assert_allclose(rollout.sprung_nodes(AT + 1), place, atol=1e-7)
+    np.testing.assert_array_equal(rollout.sprung_nodes(AT), own)
+    control = rollout.control[AT + 1]
+    np.testing.assert_allclose(
+        rollout.strains(AT + 1), spring_strains(later, place, control), atol=3e-6
+    )
+    # Where they are seen, springs to the hand would be strained by a tenth more or less.
+    seen = spring_strains(later, rollout.position[AT + 1], control)
+    assert np.abs(rollout.strains(AT + 1) - seen).max() > 0.1
+    moment, _, _, _ = rollout.state(AT + 1)
+    np.testing.assert_allclose(moment, place, atol=1e-7)
+    lengths = rollout.frame_means(lambda _model, _parameters, node, *_: node)
+    np.testing.assert_allclose(lengths[AT + 1], 0.5 * (own + place), atol=2e-3)
+    assert np.abs(lengths[AT + 1] - 0.5 * (own + place) - shift).min() > 2e-4
+    arrays = rollout.restart_arrays()
+    np.testing.assert_array_equal(arrays["restart_node_shift"], shift)
+    np.testing.assert_array_equal(arrays["restart_position"], rollout.restart.position)
+
+
+@pytest.mark.parametrize("frame", [AT + 1, 17])
+def test_a_rollout_goes_on_from_where_shifted_nodes_are_seen(shifted, frame: int) -> None:
+    rollout = FittedObject.of(shifted, "lift").simulate()
+    model, (position, velocity) = rollout.going_on(frame)
+    np.testing.assert_array_equal(position, rollout.position[frame])
+    np.testing.assert_array_equal(velocity, rollout.state(frame)[1])
+    strains = spring_strains(model, position, rollout.control[frame])
+    is_kept = model.rest_length > (SHORTEST_SHARE + 1e-3) * rollout.model_in(frame).rest_length
+    assert is_kept.mean() > 0.99
+    np.testing.assert_allclose(strains[is_kept], rollout.strains(frame)[is_kept], atol=3e-6)
+    lengths = model.rest_length / rollout.model_in(frame).rest_length
+    assert np.abs(lengths - 1.0).max() > 0.01
 
 
 @pytest.mark.parametrize("frame", [0, 5, AT, AT + 1, 17])

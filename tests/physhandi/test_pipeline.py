@@ -187,7 +187,7 @@ def test_contacts_over_time_are_stored_and_kept_with_other_radii(
     contacts, model = object_.contacts, object_.model
     assert contacts is not None
     assert object_.fitted.restart is not None
-    assert object_.fitted.restart.moves_hands
+    assert object_.fitted.restart.shifts_nodes
     assert model.virtual_spring_count > 0
     assert set(model.attached[:, 0].tolist()) == {1}
     assert set(model.attached[:, 1].tolist()) == {NEVER}

@@ -206,10 +206,11 @@ def _side_rows(name: str, rollout: ObjectRollout, frame: int) -> Iterator[list[A
     first = rollout.model.object_spring_count
     springs = np.sort(rollout.model.spring_nodes[first:], axis=1)
     rest = rollout.model_in(frame).rest_length[first:]
-    for ends, force, length in zip(springs, rollout.spring_forces(frame), rest, strict=True):
+    stretched = rest * (1.0 + rollout.strains(frame)[first:])
+    lengths = zip(stretched, rest, strict=True)
+    for ends, force, both in zip(springs, rollout.spring_forces(frame), lengths, strict=True):
         node, holder = int(ends[0]), int(ends[1]) - rollout.model.node_count
-        stretched = np.linalg.norm(control[holder] - position[node])
-        numbers = rounded([*control[holder], *force, stretched, length])
+        numbers = rounded([*control[holder], *force, *both])
         yield [name, frame, "virtual_spring", node, holder, *numbers]
 
 

@@ -130,15 +130,18 @@ class Twin:
             "frame_rate": np.array(scene.frame_rate),
             "rollout": np.asarray(scene.rollout, np.float32),
             "restart_frame": np.array(scene.frame_count),
+            "restart_node_shift": np.zeros(3),
         }
         if "restart_rest_length" not in model:
             return arrays
         frame = int(model["restart_frame"][0])
         after = model["restart_rest_length"].astype(np.float64)
+        beside = model.get("restart_node_shift", np.zeros(3)).astype(np.float64)
         return arrays | {
             "restart_frame": np.array(frame),
             "restart_control": scene.control[frame, self.held].astype(np.float64) + self._shift,
-            "restart_position": model["restart_position"].astype(np.float64),
+            "restart_position": model["restart_position"].astype(np.float64) - beside,
+            "restart_node_shift": beside,
             "restart_velocity": model["restart_velocity"].astype(np.float64),
             "restart_rest_length": after,
             "restart_stiffness": self._stiffness(after),

@@ -87,6 +87,39 @@ def test_strain_that_is_averaged_agrees_with_the_oracle(device: str) -> None:
     assert np.abs(first.position[AT + 1 :] - rollout.position[AT + 1 :]).max() > 1e-4
 
 
+def test_springs_go_on_beside_where_nodes_are_seen(device: str) -> None:
+    scene = cube_scene()
+    restart = replace(another_state(scene), strain_frames=2, shifts_nodes=True)
+    model, parameters = as_model(scene)
+    rollout = Simulator(model, parameters, device=device).rollout(scene.control, restart)
+    before = simulate(scene)[0]
+    # The oracle goes on from the rollout's own nodes; what is seen is as far beside as it was.
+    shift = restart.position - before[AT]
+    after = continued_oracle(scene, replace(restart, position=before[AT].astype(np.float32)))
+    np.testing.assert_allclose(rollout.position[: AT + 1], before[: AT + 1], atol=2e-7)
+    np.testing.assert_allclose(rollout.position[AT + 1 :], after[1:] + shift, atol=1e-6)
+    moved = Simulator(model, parameters, device).rollout(
+        scene.control, replace(restart, shifts_nodes=False)
+    )
+    for wrong in (after[1:], moved.position[AT + 1 :], before[AT + 1 :] + shift):
+        assert np.abs(rollout.position[AT + 1 :] - wrong).max() > 1e-4
+    assert replace(restart, shifts_nodes=False).node_shift(before[AT]) is None
+
+
+def test_a_weight_that_is_seen_beside_where_it_hangs_does_not_swing(device: str) -> None:
+    model, parameters, control = hanging()
+    beside = model.object_node + np.float32([0.1, 0.0, 0.02])
+    restart = Restart(frame=AT, position=beside, velocity=np.zeros((1, 3), np.float32))
+    simulator = Simulator(model, parameters, device)
+    swings = simulator.rollout(control, restart).position
+    still = simulator.rollout(control, replace(restart, shifts_nodes=True)).position
+    np.testing.assert_allclose(still[AT + 1 :], beside[None].repeat(3, axis=0), atol=1e-6)
+    # A turned spring pulls it back by m g x / L on its first way.
+    length = np.hypot(0.1, HANGING - 0.02)
+    pull = GRAVITY * 0.1 / length * parameters.frame_rate**-2
+    assert beside[0, 0] - swings[AT + 1, 0, 0] == pytest.approx(pull, rel=0.02)
+
+
 def test_every_strain_is_kept() -> None:
     scene = cube_scene()
     model, parameters = as_model(scene)
@@ -251,6 +284,13 @@ def test_what_lies_on_the_ground_lies_where_it_is_seen_and_what_does_not_falls(d
     np.testing.assert_allclose(height[1:, :2], np.tile(seen[:2, 2], (8, 1)), atol=1e-4)
     assert height[-1, 2] == pytest.approx(0.004, abs=1e-4)
     np.testing.assert_allclose(simulator.rollout(control).position[-1, :, 2], 0.004, atol=1e-4)
+    # Shifted nodes lie where the rollout has them, which is as deep as before beside that.
+    shifted = replace(restart, shifts_nodes=True)
+    later = shifted.continued(model, parameters, node[None], np.zeros((1, 0, 3)))
+    np.testing.assert_allclose(later.clearance, [0.004, 0.0065, 0.004], rtol=1e-6)
+    height = simulator.rollout(control, shifted).position[:, :, 2]
+    np.testing.assert_allclose(height[1:, :2], np.tile(seen[:2, 2], (8, 1)), atol=1e-4)
+    assert height[-1, 2] == pytest.approx(0.009, abs=1e-4)
     without = restart.continued(
         model, parameters.replace(ground_height=None), node[None], np.zeros((1, 0, 3))
     )
