@@ -420,7 +420,8 @@ class Readings:
 
     def _spring_rows(self, spring: int, rollout: ObjectRollout, frame: int) -> Rows:
         model = rollout.model_in(frame)
-        point = np.concatenate([rollout.position[frame], rollout.control[frame]])
+        # Where they hold: after some restarts that is beside where they are drawn.
+        point = np.concatenate([rollout.sprung_nodes(frame), rollout.held_control(frame)])
         a, b = (int(end) for end in model.spring_nodes[spring])
         length = float(np.linalg.norm(point[b] - point[a]))
         unit, factor = length_unit(self._content)
