@@ -27,6 +27,7 @@ from support.browser.scene_page import (
     LESS_WORK,
     TIMEOUT_MS,
     ScenePage,
+    scaled_pictures,
 )
 from support.browser.small_pictures import README_PICTURES, place_pictures
 from support.waiting import LIMIT_S, until
@@ -186,8 +187,9 @@ def _complaints_in(context: BrowserContext) -> list[str]:
     complaints: list[str] = []
     context.set_default_timeout(TIMEOUT_MS)
     context.add_init_script(_REPORT_VIOLATIONS + FEWER_PICTURES)
-    if not os.environ.get(README_PICTURES):
-        context.add_init_script(COARSER_PICTURES)
+    # Else viser draws fewer pixels where it is slow, which pictures of the docs would show.
+    for_docs = bool(os.environ.get(README_PICTURES))
+    context.add_init_script(scaled_pictures(1.0) if for_docs else COARSER_PICTURES)
     context.on(
         "console",
         lambda m: (

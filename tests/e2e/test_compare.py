@@ -29,7 +29,7 @@ def lifted(served) -> str:
     source = Run.open(BUNDLED / "runs" / "towel_fold_quick")
     run = Run.create(
         served.data_dir / "runs" / "lifted",
-        name="12 mm <i>higher</i>",
+        name="raised <by 12 mm>",
         kind="simulation",
         sequences=["towel_fold"],
         config={},
@@ -59,8 +59,8 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) ->
     expected = 12.0 * FRAME / 59
     scene.until(lambda: scene.has(f"mean {expected:.3g} mm"), "the difference is told")
     # The table knows both, and the name of a user is text.
-    expect(home.locator("h1 .b")).to_contain_text("12 mm <i>higher</i>")
-    expect(home.locator(".diff.only").first).to_contain_text("12 mm <i>higher</i>")
+    expect(home.locator("h1 .b")).to_contain_text("raised <by 12 mm>")
+    expect(home.locator(".diff.only").first).to_contain_text("raised <by 12 mm>")
     # Charts of the difference and of both errors; a click goes to a frame.
     expect(home.locator("figure.chart")).to_have_count(3)
     chart = home.locator("figure.chart", has_text="Difference of A and B")
