@@ -126,9 +126,9 @@ class ObjectRollout:
         """Get what is needed to go on from a frame in another way.
 
         Returns:
-            The model, whose springs are at rest as in the frame, and those that are attached on the
-            way to the next frame for good; positions and velocities of the nodes [m, m/s]. Where
-            velocities are not known, they are differences of positions.
+            The model, whose springs have the strain that they have in the frame, and those that are
+            attached on the way to the next frame for good; positions and velocities of the nodes
+            [m, m/s]. Where velocities are not known, they are differences of positions.
         """
         restart = self.restart
         is_own = restart is None or frame <= restart.frame
@@ -180,11 +180,6 @@ class ObjectRollout:
         """Give the restart if the frame is the first one after it."""
         restart = self.restart
         return restart if restart is not None and frame == restart.frame + 1 else None
-
-    def _restarted(self, restart: Restart) -> Float[ndarray, "node 3"]:
-        """Give where springs have the nodes when it goes on from a restart [m]."""
-        own = np.asarray(self.position[restart.frame])
-        return own if restart.shifts_nodes else restart.position
 
     def _strained(self, restart: Restart) -> tuple[ndarray, ndarray]:
         """Give object and control nodes in the frames whose strain a restart keeps [m]."""
@@ -248,7 +243,8 @@ class ObjectRollout:
         """Compute the push at a moment on the way to a frame."""
         position, velocity, control, control_velocity = state
         before, restart = max(frame - 1, 0), self._restart_before(frame)
-        first = self.sprung_nodes(before) if restart is None else self._restarted(restart)
+        first = self.sprung_nodes(before)
+        first = first if restart is None else restart.start_of_springs(first)
         hand = control + (np.asarray(self.control[frame]) - self.held_control(frame))
         return push_forces(
             self.model_in(frame),

@@ -142,7 +142,7 @@ class Restart:
         own = position[-1]
         shift = self.hand_shift(model, own)
         moved = control[-1] if shift is None else control[-1] + shift
-        start = own if self.shifts_nodes else self.position
+        start = self.start_of_springs(own)
         after = rest * (1.0 + spring_strains(model, start, moved))
         scale = np.divide(after, before, out=np.ones_like(rest), where=before > COINCIDENT)
         floor = np.full_like(rest, parameters.virtual_rest_length_floor)
@@ -201,6 +201,14 @@ class Restart:
         total = [np.bincount(control, moved[:, i], model.control_count) for i in range(3)]
         count = np.maximum(np.bincount(control, minlength=model.control_count), 1)
         return (np.stack(total, axis=1) / count[:, None]).astype(np.float32)
+
+    def start_of_springs(self, position: Float[ndarray, "node 3"]) -> Float[ndarray, "node 3"]:
+        """Give where springs have the nodes when the rollout goes on [m].
+
+        Args:
+            position: The rollout's own nodes in the frame of the restart [m].
+        """
+        return position if self.shifts_nodes else self.position
 
     def node_shift(self, position: Float[ndarray, "node 3"]) -> Float32[ndarray, "node 3"] | None:
         """Give how far nodes are from where springs have them, in the frames that follow [m].

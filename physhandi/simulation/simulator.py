@@ -184,13 +184,12 @@ class Simulator:
         restart.check_nodes(self.model.node_count)
         model = restart.continued(self.model, self.parameters, position, control)
         hand_shift = restart.hand_shift(self.model, position[-1])
-        node_shift = restart.node_shift(position[-1])
-        self.reset(restart.position if node_shift is None else position[-1], restart.velocity)
+        self.reset(restart.start_of_springs(position[-1]), restart.velocity)
         self.rest_length.assign(model.rest_length)
         self.clearance.assign(model.clearance)
         if self.hand_contact is not None:
             self.hand_contact.shift(hand_shift)
-        return hand_shift, node_shift
+        return hand_shift, restart.node_shift(position[-1])
 
     def step_frame(
         self,

@@ -206,11 +206,11 @@ def _side_rows(name: str, rollout: ObjectRollout, frame: int) -> Iterator[list[A
     first = rollout.model.object_spring_count
     springs = np.sort(rollout.model.spring_nodes[first:], axis=1)
     rest = rollout.model_in(frame).rest_length[first:]
-    stretched = rest * (1.0 + rollout.strains(frame)[first:])
-    lengths = zip(stretched, rest, strict=True)
-    for ends, force, both in zip(springs, rollout.spring_forces(frame), lengths, strict=True):
+    length = rest * (1.0 + rollout.strains(frame)[first:])
+    rows = zip(springs, rollout.spring_forces(frame), length, rest, strict=True)
+    for ends, force, *lengths in rows:
         node, holder = int(ends[0]), int(ends[1]) - rollout.model.node_count
-        numbers = rounded([*control[holder], *force, *both])
+        numbers = rounded([*control[holder], *force, *lengths])
         yield [name, frame, "virtual_spring", node, holder, *numbers]
 
 

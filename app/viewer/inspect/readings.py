@@ -420,23 +420,21 @@ class Readings:
 
     def _spring_rows(self, spring: int, rollout: ObjectRollout, frame: int) -> Rows:
         model = rollout.model_in(frame)
-        # Where they hold: after some restarts that is beside where they are drawn.
-        point = np.concatenate([rollout.sprung_nodes(frame), rollout.held_control(frame)])
-        a, b = (int(end) for end in model.spring_nodes[spring])
-        length = float(np.linalg.norm(point[b] - point[a]))
+        strain = float(rollout.strains(frame)[spring])
         unit, factor = length_unit(self._content)
         names = [
             f"node {end}" if end < model.node_count else f"control node {end - model.node_count}"
-            for end in (a, b)
+            for end in map(int, model.spring_nodes[spring])
         ]
         stiffness = rollout.parameters.stiffness_scale * float(model.stiffness[spring])
         rest = float(model.rest_length[spring])
+        length = (1.0 + strain) * rest
         lengths = f"{number(factor * length)} {unit}, at rest {number(factor * rest)} {unit}"
         newtons = self._painter.force_factor
         return [
             ("joins", " and ".join(names)),
             ("length", lengths),
-            ("strain", f"{number(1e2 * float(rollout.strains(frame)[spring]))} %"),
+            ("strain", f"{number(1e2 * strain)} %"),
             ("pull", f"{number(newtons * float(rollout.tensions(frame)[spring]))} N"),
             ("stiffness", f"{number(newtons * stiffness)} N"),
             ("damping", f"{number(newtons * float(model.damping[spring]))} N·s/m"),

@@ -34,11 +34,11 @@ def observed_state(
     """Estimate position and velocity of the nodes in a frame.
 
     Each node is moved by the mean residual of the tracks around it, or by that of its own where
-    tracks say which node they observe (`metrics.baselines.last_residual`), but not below
-    the ground. Its velocity is that of the line that fits best to where it was
-    seen, found in the same way, in the last `VELOCITY_FRAMES` frames: springs of a rollout swing
-    about the true motion, and their velocity is less sure than no velocity at all. It is the
-    rollout's if the frame before shows no track.
+    tracks say which node they observe (`metrics.baselines.last_residual`), but not below the
+    ground. Its velocity is that of the line that fits best to where it was seen, found in the same
+    way, in the last `VELOCITY_FRAMES` frames: springs of a rollout swing about the true motion, and
+    their velocity is less sure than no velocity at all. It is the rollout's if the frame before
+    shows no track.
 
     Args:
         model: Fitted nodes and springs.
