@@ -23,7 +23,10 @@ from physhandi.simulation.parameters import SimulationParameters
 
 def watch(sessions: Sessions) -> ViewerClient:
     session = sessions.get(sessions.open("run", "sheet", "me"))
-    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+    client = ViewerClient(f"ws://127.0.0.1:{session.port}")
+    # The readout comes when the whole panel is there: what is set before that was lost once.
+    client.until(lambda: "object springs" in client.texts())
+    return client
 
 
 def drawn(client: ViewerClient) -> str:
