@@ -1,8 +1,10 @@
 """Base of all live scenes: a viser server of their own, an owner, and connected viewers."""
 
+import asyncio
 import threading
 import time
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from typing import Any, Protocol
 
 import rich
@@ -25,6 +27,25 @@ _FROM_BELOW = 0.9
 underside (1, 23, 29) was seen, and (0, 80, 94) is with this."""
 
 
+class _LoopEvent(asyncio.Event):
+    """An event of an event loop that any thread may set.
+
+    Viser sets its own from the thread that has something to send, which asyncio does not allow: if
+    that comes between the loop's looking at the event and its waiting for it, nothing ever wakes
+    the loop again and the client sees no more of the scene; or setting it fails because the loop
+    changes who waits meanwhile.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__()
+        self._home = loop
+
+    def set(self) -> None:
+        """Have the loop set it; a loop that is closed has nobody to wake."""
+        with suppress(RuntimeError):
+            self._home.call_soon_threadsafe(super().set)
+
+
 def start_viser(label: str) -> viser.ViserServer:
     """Start a viser server on a free loopback port.
 
@@ -36,6 +57,13 @@ def start_viser(label: str) -> viser.ViserServer:
     # Any client could ask for a public tunnel with this message.
     infrastructure: Any = server._websock_server  # noqa: SLF001  # no other way
     infrastructure.unregister_handler(messages.ShareUrlRequest)
+    loop = server.get_event_loop()
+
+    def let_threads_send(sender: Any) -> None:
+        sender.get_message_buffer().message_event = _LoopEvent(loop)
+
+    let_threads_send(infrastructure)
+    infrastructure.on_client_connect(let_threads_send)  # Called before anything is sent to it.
     upright = (1.0, 0.0, 0.0, 0.0)
     infrastructure.queue_message(  # viser's own function knows its own images alone.
         messages.EnvironmentMapMessage(

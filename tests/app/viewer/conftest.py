@@ -15,6 +15,7 @@ from support.viewer.viewer_world import (
 from app.viewer.physics.edit_presets import EditPresetStore
 from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
+from app.viewer.scene.scene_server import start_viser
 from app.viewer.sessions import Sessions
 from physhandi.run import Run
 
@@ -82,7 +83,7 @@ def sessions(catalog: FolderCatalog, storage: UserStorage) -> Iterator[Sessions]
 @pytest.fixture
 def server() -> Iterator[viser.ViserServer]:
     """A bare viser server."""
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server = start_viser("bare")
     yield server
     server.stop()
 

@@ -10,6 +10,7 @@ from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import PLAYING_SPRINGS
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import SceneDrawing
+from app.viewer.scene.scene_server import start_viser
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.object_surface import lay_surface
 from physhandi.simulation.parameters import SimulationParameters
@@ -52,7 +53,7 @@ def large_content() -> Content:
 
 @pytest.fixture
 def server() -> Iterator[viser.ViserServer]:
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server = start_viser("bare")
     yield server
     server.stop()
 

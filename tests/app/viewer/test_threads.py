@@ -4,6 +4,7 @@ import asyncio
 import socket
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,6 +25,7 @@ from app.viewer.content.session_state import Pose
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
 from app.viewer.physics.history import TriedSetting
+from app.viewer.scene.scene_server import start_viser
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 
@@ -52,6 +54,47 @@ def write_all(session: Session) -> None:
     """Wait until viser's event loop has written what was handed to it."""
     loop = session._server.get_event_loop()
     asyncio.run_coroutine_threadsafe(asyncio.sleep(0), loop).result(PATIENCE)
+
+
+class Interrupted(deque):
+    """Those who wait for an event; another thread acts just before the next one joins them."""
+
+    def __init__(self, waiting: deque, act: Callable[[], Any]) -> None:
+        super().__init__(waiting)
+        self._act: Callable[[], Any] | None = act
+
+    def append(self, waiter: Any) -> None:
+        act, self._act = self._act, None
+        if act is not None:
+            beside(act).join()
+        super().append(waiter)
+
+
+@pytest.mark.parametrize("whose", ["all", "one"])
+def test_what_a_thread_sends_while_viser_goes_to_wait_arrives(whose: str) -> None:
+    server = start_viser("sender")
+    try:
+        with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
+            client.until(server.get_clients)
+            target = server if whose == "all" else next(iter(server.get_clients().values()))
+            sender = server._websock_server if target is server else target._websock_connection
+            event = sender.get_message_buffer().message_event
+            came = threading.Event()
+
+            def send_between() -> None:
+                target.gui.add_markdown("sent between looking and waiting")
+                came.set()
+
+            def interrupt() -> None:
+                event._waiters = Interrupted(event._waiters, send_between)
+
+            server.get_event_loop().call_soon_threadsafe(interrupt)
+            target.gui.add_markdown("sent before")
+            client.until(lambda: "sent between looking and waiting" in client.texts())
+            assert came.is_set()
+            assert "sent before" in client.texts()
+    finally:
+        server.stop()
 
 
 def test_a_scrub_that_met_a_frame_on_its_way_is_told_where_it_stands(sessions: Sessions) -> None:
