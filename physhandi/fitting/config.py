@@ -391,8 +391,8 @@ class PredictionConfig(Settings, frozen=True, kw_only=True):
     kept, instead of the rollout's own state. Off where a run's settings say nothing of it, as those
     of older runs, which do not restart."""
     strain_time: Annotated[float, Meta(ge=0.0, le=1e3)] = 1.0
-    """Time until the last fitted frame over which the strain that springs keep is averaged; 0 keeps
-    that of the frame alone [s]."""
+    """Time until the last fitted frame over which the strain that springs keep is averaged, except
+    of what lies on the ground; 0 keeps that of the frame alone [s]."""
 
 
 class PipelineConfig(Settings, frozen=True, kw_only=True):

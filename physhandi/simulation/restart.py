@@ -32,7 +32,13 @@ FIRM_HOLD = 4
 """Virtual springs that fix the place of a node, whatever hangs on it."""
 COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
-_OPTIONAL = {"moves_hands": 0, "eases_grips": 0, "strain_frames": 1, "shifts_nodes": 0}
+_OPTIONAL = {
+    "moves_hands": 0,
+    "eases_grips": 0,
+    "strain_frames": 1,
+    "averages_in_air": 0,
+    "shifts_nodes": 0,
+}
 """Single numbers that a stored restart may lack, and what they are then."""
 
 NodeState = tuple[Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]
@@ -87,6 +93,10 @@ class Restart:
     strain_frames: int = 1
     """Frames, that of the restart and those before it, over which the strain that springs keep is
     averaged; 1 keeps that of the moment."""
+    averages_in_air: bool = False
+    """Whether springs between nodes that lie on the ground, and virtual springs of such nodes, keep
+    the strain of the moment however many frames that of the others is averaged over. Friction holds
+    what lies: it does not swing, and what it is pulled by turns as soon as the hand does."""
     shifts_nodes: bool = False
     """Whether springs go on where the rollout has them, and every node is from then on as far
     beside that as `position` is (`node_shift`). No spring is turned, so none throws its nodes.
@@ -138,8 +148,9 @@ class Restart:
             control: Control nodes in them [m].
         """
         rest = model.rest_length.astype(np.float64)
-        before = rest * (1.0 + self._kept_strain(model, position, control))
         own = position[-1]
+        rests = _rests_on(model, parameters.ground_height, own)
+        before = rest * (1.0 + self._kept_strain(model, position, control, rests))
         shift = self.hand_shift(model, own)
         moved = control[-1] if shift is None else control[-1] + shift
         start = self.start_of_springs(own)
@@ -148,7 +159,6 @@ class Restart:
         floor = np.full_like(rest, parameters.virtual_rest_length_floor)
         floor[: model.object_spring_count] = parameters.rest_length_floor
         shortest = np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
-        rests = _rests_on(model, parameters.ground_height, own)
         scaled = scale * rest
         if self.eases_grips:
             held = model.spring_nodes[model.object_spring_count :].min(axis=1)
@@ -167,14 +177,26 @@ class Restart:
         model: SpringMassModel,
         position: Float[ndarray, "strained node 3"],
         control: Float[ndarray, "strained control 3"],
+        rests: Bool[ndarray, " node"],
     ) -> Float[ndarray, " spring"]:
-        """Average strain over the frames in which a spring acts, if it does in the last one."""
+        """Average strain over the frames in which a spring acts, if it does in the last one.
+
+        Args:
+            model: The springs until the restart.
+            position: The rollout's own nodes in the `strained_frames` [m].
+            control: Control nodes in them [m].
+            rests: Nodes that lie on the ground in the last of them.
+        """
         acts = np.stack([model.acts_in(frame) for frame in self.strained_frames]).astype(np.float64)
         acts[:-1] *= acts[-1]
         acts[-1] = 1.0
         each = zip(acts, position, control, strict=True)
         total = sum(share * spring_strains(model, *place) for share, *place in each)
-        return total / acts.sum(axis=0)
+        mean = total / acts.sum(axis=0)
+        if not self.averages_in_air:
+            return mean
+        lies = np.append(rests, np.ones(model.control_count, bool))[model.spring_nodes].all(axis=1)
+        return np.where(lies, spring_strains(model, position[-1], control[-1]), mean)
 
     def hand_shift(
         self, model: SpringMassModel, position: Float[ndarray, "node 3"]
@@ -255,6 +277,7 @@ class Restart:
             moves_hands=bool(single["moves_hands"][0]),
             eases_grips=bool(single["eases_grips"][0]),
             strain_frames=int(single["strain_frames"][0]),
+            averages_in_air=bool(single["averages_in_air"][0]),
             shifts_nodes=bool(single["shifts_nodes"][0]),
         )
 

@@ -188,6 +188,7 @@ def test_contacts_over_time_are_stored_and_kept_with_other_radii(
     assert contacts is not None
     assert object_.fitted.restart is not None
     assert object_.fitted.restart.shifts_nodes
+    assert object_.fitted.restart.averages_in_air
     assert model.virtual_spring_count > 0
     assert set(model.attached[:, 0].tolist()) == {1}
     assert set(model.attached[:, 1].tolist()) == {NEVER}

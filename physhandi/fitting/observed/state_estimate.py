@@ -47,7 +47,8 @@ def observed_state(
         observation: What was seen; only frame 0, the frame itself and those before it are read.
         frame: The frame.
         device: Warp device.
-        strain_time: Time until the frame over which the strain of springs is averaged [s].
+        strain_time: Time until the frame over which the strain of springs in the air is
+            averaged [s].
 
     Raises:
         MissingInputError: If the frame shows no track whose place on the object is known.
@@ -66,6 +67,7 @@ def observed_state(
         position=position.astype(np.float32),
         velocity=velocity.astype(np.float32),
         strain_frames=max(1, round(strain_time * parameters.simulated_frame_rate)),
+        averages_in_air=True,
         shifts_nodes=True,
     )
 

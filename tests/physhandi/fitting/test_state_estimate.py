@@ -115,6 +115,7 @@ def test_strain_is_averaged_over_a_time() -> None:
     for time, frames in ((0.0, 1), (0.4 / rate, 1), (2.6 / rate, 3), (0.5, round(0.5 * rate))):
         found = observed_state(model, parameters, SCENE.control, shift, LAST, strain_time=time)
         assert found.strain_frames == frames
+        assert found.averages_in_air
 
 
 def test_without_a_track_there_is_no_state() -> None:

@@ -159,6 +159,46 @@ def test_a_spring_is_averaged_over_the_frames_in_which_it_acts() -> None:
     np.testing.assert_allclose(later.rest_length, 1.8 / np.array(mean), rtol=1e-6)
 
 
+def test_strain_of_what_lies_on_the_ground_is_that_of_the_moment() -> None:
+    # Four nodes in a row, of which the first two lie; springs between neighbors, then two virtual
+    # ones, of a node that lies and of one that does not.
+    row = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 1], [3, 0, 1]], np.float32)
+    model = SpringMassModel(
+        object_node=row,
+        initial_velocity=np.zeros_like(row),
+        spring_nodes=np.array([[0, 1], [1, 2], [2, 3], [0, 4], [3, 5]], np.int32),
+        rest_length=np.ones(5, np.float32),
+        stiffness=np.ones(5, np.float32),
+        damping=np.ones(5, np.float32),
+        object_spring_count=3,
+        control_count=2,
+    )
+    control = np.array([[0, 1, 0], [3, 1, 1]], float)
+    first = row * [1.0, 1, 1] + [0.5, 0, 0] * np.arange(4)[:, None]  # Stretched along the row.
+    places, hands = np.stack([first, row]), np.stack([control, control * [1, 1.4, 1]])
+    restart = Restart(
+        frame=3,
+        position=row,
+        velocity=row,
+        strain_frames=2,
+        averages_in_air=True,
+        shifts_nodes=True,
+    )
+    parameters = SimulationParameters(
+        ground_height=0.0, rest_length_floor=0.0, virtual_rest_length_floor=0.0
+    )
+    strains = [spring_strains(model, *place) for place in zip(places, hands, strict=True)]
+    assert np.abs(strains[1] - strains[0]).min() > 0.2
+    kept = np.where([1, 0, 0, 1, 0], strains[1], np.mean(strains, axis=0))
+    later = restart.continued(model, parameters, places, hands)
+    np.testing.assert_allclose(spring_strains(later, row, hands[1]), kept, rtol=1e-6)
+    # Where nothing lies, or where all springs are averaged.
+    mean = np.mean(strains, axis=0)
+    for other, ground in ((restart, None), (replace(restart, averages_in_air=False), 0.0)):
+        later = other.continued(model, parameters.replace(ground_height=ground), places, hands)
+        np.testing.assert_allclose(spring_strains(later, row, hands[1]), mean, rtol=1e-6)
+
+
 def hanging() -> tuple[SpringMassModel, SimulationParameters, np.ndarray]:
     """1 kg that hangs at rest below a control node, and controls for six frames."""
     model = SpringMassModel(
@@ -318,10 +358,12 @@ def test_a_restart_that_does_not_fit_is_refused() -> None:
     again = Restart.from_tensors(kept.to_tensors())
     assert (again.frame, again.position[0, 0], again.velocity[0, 0]) == (3, 1.0, 2.0)
     assert again.strain_frames == 1
-    averaged = replace(kept, strain_frames=15).to_tensors()
+    averaged = replace(kept, strain_frames=15, averages_in_air=True).to_tensors()
     assert Restart.from_tensors(averaged).strain_frames == 15
-    del averaged["strain_frames"]
+    assert Restart.from_tensors(averaged).averages_in_air
+    del averaged["strain_frames"], averaged["averages_in_air"]
     assert Restart.from_tensors(averaged).strain_frames == 1
+    assert not Restart.from_tensors(averaged).averages_in_air
     with pytest.raises(ValueError, match="strain_frames has 2 values; expected one"):
         Restart.from_tensors({**averaged, "strain_frames": np.ones(2, np.int32)})
     with pytest.raises(ValueError, match="strain_frames is 0; expected 1 or more"):
