@@ -90,9 +90,9 @@ def test_what_a_thread_sends_while_viser_goes_to_wait_arrives(whose: str) -> Non
 
             server.get_event_loop().call_soon_threadsafe(interrupt)
             target.gui.add_markdown("sent before")
-            client.until(lambda: "sent between looking and waiting" in client.texts())
+            texts = "sent before", "sent between looking and waiting"
+            client.until(lambda: all(text in client.texts() for text in texts))
             assert came.is_set()
-            assert "sent before" in client.texts()
     finally:
         server.stop()
 
