@@ -216,12 +216,12 @@ def stages_of(run: Run, state: str) -> list[dict[str, Any]]:
         run: The run.
         state: State of the run, as the queue knows it.
     """
-    if run.attempt is None:
+    attempt = run.attempt  # Read once: a run that is deleted meanwhile has none.
+    if attempt is None:
         return [asdict(StageView(name, "to-come")) for name in _names(run)]
     finished = run.stages()
     progress = run.progress
-    is_current = progress.get("attempt") == run.attempt
-    latest = str(progress["stage"]) if is_current else None
+    latest = str(progress["stage"]) if progress.get("attempt") == attempt else None
     views = stage_views(_names(run), finished, state, latest)
     begun = _running_since(run, finished)
     now = datetime.now(UTC).timestamp()

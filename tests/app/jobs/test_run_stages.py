@@ -1,8 +1,10 @@
 """Where a run is on its way, and why it stopped."""
 
+import shutil
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from support.server.run_world import make_run
@@ -92,6 +94,27 @@ def test_the_time_of_a_stage_is_measured_and_an_older_attempts_report_is_forgott
         shown = {s["name"]: s["state"] for s in stages_of(run, "running")}
         assert (shown[STAGES[0]], shown[STAGES[1]]) == ("done", "at-work")
         assert shown[STAGES[3]] == "to-come"
+
+
+def test_a_run_may_be_deleted_while_its_stages_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path / "run")
+    with run.begin_attempt() as attempt:
+        attempt.finish_stage(STAGES[0], {})
+        attempt.progress().report(STAGES[1], 1, 2)
+    told = stages_of(run, "failed")
+    assert {s["name"]: s["state"] for s in told}[STAGES[1]] == "failed"
+    read = Run.stages
+
+    def deleted_then(run: Run) -> list[dict[str, Any]]:
+        stages = read(run)
+        shutil.rmtree(run.folder)
+        return stages
+
+    monkeypatch.setattr(Run, "stages", deleted_then)
+    assert stages_of(run, "failed") == told
+    assert run.attempt is None
 
 
 @pytest.mark.parametrize(
