@@ -190,13 +190,12 @@ class Restart:
         acts = np.stack([model.acts_in(frame) for frame in self.strained_frames]).astype(np.float64)
         acts[:-1] *= acts[-1]
         acts[-1] = 1.0
+        if self.averages_in_air:
+            lies = np.append(rests, np.ones(model.control_count, bool))
+            acts[:-1, lies[model.spring_nodes].all(axis=1)] = 0.0
         each = zip(acts, position, control, strict=True)
         total = sum(share * spring_strains(model, *place) for share, *place in each)
-        mean = total / acts.sum(axis=0)
-        if not self.averages_in_air:
-            return mean
-        lies = np.append(rests, np.ones(model.control_count, bool))[model.spring_nodes].all(axis=1)
-        return np.where(lies, spring_strains(model, position[-1], control[-1]), mean)
+        return total / acts.sum(axis=0)
 
     def hand_shift(
         self, model: SpringMassModel, position: Float[ndarray, "node 3"]

@@ -41,9 +41,10 @@ class _LoopEvent(asyncio.Event):
         self._home = loop
 
     def set(self) -> None:
-        """Have the loop set it; a loop that is closed has nobody to wake."""
-        with suppress(RuntimeError):
-            self._home.call_soon_threadsafe(super().set)
+        """Have the loop set it, unless it is set; a loop that is closed has nobody to wake."""
+        if not self.is_set():  # Viser looks for messages after it has cleared the event.
+            with suppress(RuntimeError):
+                self._home.call_soon_threadsafe(super().set)
 
 
 def start_viser(label: str) -> viser.ViserServer:

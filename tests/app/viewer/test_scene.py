@@ -1,8 +1,5 @@
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
-import viser
 from support.viewer.viewer_client import ViewerClient
 from support.viewer.viewer_world import hear_all
 
@@ -10,7 +7,6 @@ from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import PLAYING_SPRINGS
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import SceneDrawing
-from app.viewer.scene.scene_server import start_viser
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.object_surface import lay_surface
 from physhandi.simulation.parameters import SimulationParameters
@@ -49,13 +45,6 @@ def large_content() -> Content:
         fitted=fitted,
         surface=lay_surface(node, kind="solid"),
     )
-
-
-@pytest.fixture
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("bare")
-    yield server
-    server.stop()
 
 
 @pytest.mark.parametrize(("color", "surface"), [("plain", False), ("speed", True)])

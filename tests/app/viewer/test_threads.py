@@ -25,7 +25,6 @@ from app.viewer.content.session_state import Pose
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
 from app.viewer.physics.history import TriedSetting
-from app.viewer.scene.scene_server import start_viser
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 
@@ -71,30 +70,25 @@ class Interrupted(deque):
 
 
 @pytest.mark.parametrize("whose", ["all", "one"])
-def test_what_a_thread_sends_while_viser_goes_to_wait_arrives(whose: str) -> None:
-    server = start_viser("sender")
-    try:
-        with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
-            client.until(server.get_clients)
-            target = server if whose == "all" else next(iter(server.get_clients().values()))
-            sender = server._websock_server if target is server else target._websock_connection
-            event = sender.get_message_buffer().message_event
-            came = threading.Event()
+def test_what_a_thread_sends_while_viser_goes_to_wait_arrives(server_client, whose: str) -> None:
+    server, client = server_client
+    target = server if whose == "all" else next(iter(server.get_clients().values()))
+    sender = server._websock_server if target is server else target._websock_connection
+    event = sender.get_message_buffer().message_event
+    came = threading.Event()
 
-            def send_between() -> None:
-                target.gui.add_markdown("sent between looking and waiting")
-                came.set()
+    def send_between() -> None:
+        target.gui.add_markdown("sent between looking and waiting")
+        came.set()
 
-            def interrupt() -> None:
-                event._waiters = Interrupted(event._waiters, send_between)
+    def interrupt() -> None:
+        event._waiters = Interrupted(event._waiters, send_between)
 
-            server.get_event_loop().call_soon_threadsafe(interrupt)
-            target.gui.add_markdown("sent before")
-            texts = "sent before", "sent between looking and waiting"
-            client.until(lambda: all(text in client.texts() for text in texts))
-            assert came.is_set()
-    finally:
-        server.stop()
+    server.get_event_loop().call_soon_threadsafe(interrupt)
+    target.gui.add_markdown("sent before")
+    texts = "sent before", "sent between looking and waiting"
+    client.until(lambda: all(text in client.texts() for text in texts))
+    assert came.is_set()
 
 
 def test_a_scrub_that_met_a_frame_on_its_way_is_told_where_it_stands(sessions: Sessions) -> None:
