@@ -32,7 +32,12 @@ from physhandi.simulation.forces import (
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.object_surface import ObjectSurface, lay_surface
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.restart import NodeState, Restart, start_from_tensors
+from physhandi.simulation.restart import (
+    NodeState,
+    Restart,
+    shortest_rest_lengths,
+    start_from_tensors,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -75,7 +80,8 @@ class ObjectRollout:
     """Reads the hands and names that `export` writes beside the motion, if they are known."""
     surface: Callable[[], ObjectSurface | None] | None = None
     """Lays the surface that `export` writes, if it is known what the object looks like."""
-    _continued: SpringMassModel | None = field(default=None, init=False, repr=False)
+    _continued: dict[int, SpringMassModel] = field(default_factory=dict, init=False, repr=False)
+    """Springs on the way to frames after the restart, whether they are attached or not."""
 
     @classmethod
     def empty(
@@ -113,14 +119,26 @@ class ObjectRollout:
 
         Springs that are not attached in the frame have no stiffness and no damping.
         """
+        return self._springs(frame).held_in(frame)
+
+    def _springs(self, frame: int) -> SpringMassModel:
+        """Get the springs on the way to a frame, whether they are attached then or not."""
         restart = self.restart
         if restart is None or frame <= restart.frame:
-            return self.model.held_in(frame)
-        if self._continued is None:
-            self._continued = restart.continued(
-                self.model, self.parameters, *self._strained(restart)
-            )
-        return self._continued.held_in(frame)
+            return self.model
+        if restart.grip_strength == 0.0:  # They are the same from the restart on.
+            frame = restart.frame + 1
+        if not self._continued:
+            strained = self._strained(restart)
+            first = restart.continued(self.model, self.parameters, *strained)
+            self._continued[restart.frame + 1] = first
+        for reached in range(max(each for each in [*self._continued] if each <= frame), frame):
+            before = self._continued[reached]
+            state = self.sprung_nodes(reached), self.held_control(reached)
+            rest = restart.slipped(self.model, self.parameters, before.rest_length, reached, *state)
+            after = before if rest is before.rest_length else replace(before, rest_length=rest)
+            self._continued[reached + 1] = after
+        return self._continued[frame]
 
     def going_on(self, frame: int) -> tuple[SpringMassModel, NodeState]:
         """Get what is needed to go on from a frame in another way.
@@ -132,9 +150,7 @@ class ObjectRollout:
         """
         restart = self.restart
         is_own = restart is None or frame <= restart.frame
-        if not is_own and self._continued is None:
-            self.model_in(frame)  # Finds it out.
-        whole = self.model if is_own or self._continued is None else self._continued
+        whole = self.model if is_own else self._springs(frame + 1)
         place, velocity, control, _ = self.state(frame)
         if frame == 0:
             velocity = self.model.initial_velocity if self.start is None else self.start[1]
@@ -195,7 +211,8 @@ class ObjectRollout:
             ``restart_hand_shift`` of every control node from then on [m], if hands are moved;
             ``restart_node_shift`` [m], if springs have the nodes that far from where they are seen;
             ``restart_rest_length`` of every spring and ``restart_clearance`` of every node from
-            then on [m]. Nothing if no frame that is ready comes after a restart.
+            then on [m], and, if grips slip, ``restart_shortest`` of every spring, the least rest
+            length that it may have [m]. Nothing if no frame that is ready comes after a restart.
         """
         if self.restart is None or self.restart.frame >= self.ready:
             return {}
@@ -207,6 +224,8 @@ class ObjectRollout:
         beside = self._node_shift(self.restart.frame + 1)
         if beside is not None:
             state["restart_node_shift"] = beside
+        if self.restart.grip_strength > 0.0:
+            state["restart_shortest"] = shortest_rest_lengths(self.model, self.parameters)
         return state | {
             "restart_rest_length": model.rest_length,
             "restart_clearance": model.clearance,
@@ -333,6 +352,8 @@ class ObjectRollout:
                 weight = (0.5 if stop in {0, count} else 1.0) / count
                 mean = mean + weight * np.asarray(measure(frame, *state), np.float64)
                 before = place
+            if self.restart is not None and frame > self.restart.frame:
+                simulator.let_grips_slip(self.restart, frame, before)
             means.append(mean)
         return np.stack(means)
 

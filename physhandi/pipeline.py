@@ -398,6 +398,7 @@ def _store_restart(
             sequence.reconstruction_frames[-1],
             device=device,
             strain_time=config.prediction.strain_time,
+            grip_strength=config.prediction.grip_strength,
         )
     except MissingInputError as error:
         raise MissingInputError(f"Sequence '{sequence.name}': {error}") from error

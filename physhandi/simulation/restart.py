@@ -9,6 +9,9 @@ higher; they lie on it where they are seen.
 But directions of springs are then others, and each spring that is a little turned throws its nodes.
 So springs may go on where the rollout has them, and every node is shown as far beside that as it
 was seen there: what a fit missed is a shift, not a force.
+
+A spring between hand and object holds however hard it is pulled. Where nobody observes any more
+whether a finger slips, it does beyond a tension (`grip_strength`).
 """
 
 from collections.abc import Mapping
@@ -38,6 +41,7 @@ _OPTIONAL = {
     "strain_frames": 1,
     "averages_in_air": 0,
     "shifts_nodes": 0,
+    "grip_strength": 0.0,
 }
 """Single numbers that a stored restart may lack, and what they are then."""
 
@@ -101,10 +105,17 @@ class Restart:
     """Whether springs go on where the rollout has them, and every node is from then on as far
     beside that as `position` is (`node_shift`). No spring is turned, so none throws its nodes.
     (`moves_hands` and `eases_grips` are of older runs, which moved the nodes themselves.)"""
+    grip_strength: float = 0.0
+    """Tension beyond which a virtual spring slips at the end of a frame after the restart (see
+    `slipped`), as a finger does that friction no longer holds [N]; 0 if none ever slips."""
 
     def __post_init__(self) -> None:
         if self.frame < 0:
             raise ValueError(f"frame is {self.frame}; expected 0 or later.")
+        if not 0.0 <= self.grip_strength < np.inf:
+            raise ValueError(
+                f"grip_strength is {self.grip_strength}; expected 0 or more, and finite."
+            )
         if self.strain_frames < 1:
             raise ValueError(f"strain_frames is {self.strain_frames}; expected 1 or more.")
         for name in ("position", "velocity"):
@@ -156,16 +167,13 @@ class Restart:
         start = self.start_of_springs(own)
         after = rest * (1.0 + spring_strains(model, start, moved))
         scale = np.divide(after, before, out=np.ones_like(rest), where=before > COINCIDENT)
-        floor = np.full_like(rest, parameters.virtual_rest_length_floor)
-        floor[: model.object_spring_count] = parameters.rest_length_floor
-        shortest = np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
         scaled = scale * rest
         if self.eases_grips:
             held = model.spring_nodes[model.object_spring_count :].min(axis=1)
             is_eased = np.zeros(len(rest), bool)
             is_eased[model.object_spring_count :] = rests[held]
             scaled = np.where(is_eased, after, scaled)
-        scaled = np.maximum(scaled, shortest).astype(np.float32)
+        scaled = np.maximum(scaled, shortest_rest_lengths(model, parameters)).astype(np.float32)
         clearance = model.clearance
         if parameters.ground_height is not None:
             height = np.maximum(start[:, 2] - parameters.ground_height, 0.0)
@@ -196,6 +204,49 @@ class Restart:
         each = zip(acts, position, control, strict=True)
         total = sum(share * spring_strains(model, *place) for share, *place in each)
         return total / acts.sum(axis=0)
+
+    def slipped(  # noqa: PLR0917  (the springs, then the state at a frame's end)
+        self,
+        model: SpringMassModel,
+        parameters: SimulationParameters,
+        rest_length: Float32[ndarray, " spring"],
+        frame: int,
+        position: Float[ndarray, "node 3"],
+        control: Float[ndarray, "control 3"],
+    ) -> Float32[ndarray, " spring"]:
+        """Give the rest lengths for what follows a frame, at whose end some grips slip.
+
+        A virtual spring of stiffness Y whose tension is beyond the `grip_strength` T goes on with
+        that: ``r = L / (1 + T / Y)``, or ``L / (1 - T / Y)`` if it is pressed, where L is its
+        length, but no shorter than `continued` may make it. What has slipped does not come back
+        when the hand turns, as what a spring was stretched by would.
+
+        Args:
+            model: The springs, with the rest lengths that they have until the restart.
+            parameters: For the stiffness and the floors of the rest lengths.
+            rest_length: What springs had on the way to the frame [m].
+            frame: The frame, after the restart.
+            position: Where springs have the object nodes at its end [m].
+            control: Where virtual springs end then [m].
+        """
+        virtual = slice(model.object_spring_count, None)
+        ends = model.spring_nodes[virtual]
+        if self.grip_strength == 0.0 or len(ends) == 0:
+            return rest_length
+        place = np.concatenate([position, control]).astype(np.float64)
+        length = np.linalg.norm(place[ends[:, 1]] - place[ends[:, 0]], axis=1)
+        rest = rest_length[virtual].astype(np.float64)
+        stiffness = parameters.stiffness_scale * model.stiffness[virtual].astype(np.float64)
+        strain = length / rest - 1.0
+        slips = model.acts_in(frame)[virtual] & (stiffness * np.abs(strain) > self.grip_strength)
+        borne = np.copysign(self.grip_strength / stiffness[slips], strain[slips])
+        rest[slips] = np.maximum(
+            length[slips] / (1.0 + borne),
+            shortest_rest_lengths(model, parameters)[virtual][slips],
+        )
+        later = rest_length.copy()
+        later[virtual] = rest
+        return later
 
     def hand_shift(
         self, model: SpringMassModel, position: Float[ndarray, "node 3"]
@@ -246,7 +297,12 @@ class Restart:
         """Return every field as an array, ready for safetensors."""
         frame = np.array([self.frame], dtype=np.int32)
         state = {"frame": frame, "position": self.position, "velocity": self.velocity}
-        return state | {name: np.array([getattr(self, name)], dtype=np.int32) for name in _OPTIONAL}
+        return state | {
+            name: np.array(
+                [getattr(self, name)], np.float32 if isinstance(default, float) else np.int32
+            )
+            for name, default in _OPTIONAL.items()
+        }
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Restart":
@@ -278,7 +334,18 @@ class Restart:
             strain_frames=int(single["strain_frames"][0]),
             averages_in_air=bool(single["averages_in_air"][0]),
             shifts_nodes=bool(single["shifts_nodes"][0]),
+            grip_strength=float(single["grip_strength"][0]),
         )
+
+
+def shortest_rest_lengths(
+    model: SpringMassModel, parameters: SimulationParameters
+) -> Float[ndarray, " spring"]:
+    """Give the least rest length that each spring may get after a restart [m]."""
+    rest = model.rest_length.astype(np.float64)
+    floor = np.full_like(rest, parameters.virtual_rest_length_floor)
+    floor[: model.object_spring_count] = parameters.rest_length_floor
+    return np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
 
 
 def _rests_on(

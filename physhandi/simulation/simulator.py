@@ -191,6 +191,23 @@ class Simulator:
             self.hand_contact.shift(hand_shift)
         return hand_shift, restart.node_shift(position[-1])
 
+    def let_grips_slip(
+        self, restart: Restart, frame: int, control: Float[ndarray, "control 3"]
+    ) -> None:
+        """Change rest lengths for what follows a frame as a restart before it lets grips slip.
+
+        Args:
+            restart: The state from which the simulation went on.
+            frame: The frame that has been reached, a later one than the restart's.
+            control: Where virtual springs end now [m].
+        """
+        if restart.grip_strength == 0.0:
+            return
+        springs, now = self.rest_length.numpy(), self.position.numpy()
+        self.rest_length.assign(
+            restart.slipped(self.model, self.parameters, springs, frame, now, control)
+        )
+
     def step_frame(
         self,
         frame: int,
@@ -261,7 +278,10 @@ class Simulator:
         for frame in range(len(control)):
             if frame > 0:
                 way = control[frame - 1 : frame + 1]
-                self.step_frame(frame, *(way if hand_shift is None else way + hand_shift))
+                way = way if hand_shift is None else way + hand_shift
+                self.step_frame(frame, *way)
+                if restart is not None and frame > restart.frame:
+                    self.let_grips_slip(restart, frame, way[1])
             position = self.position.numpy().copy()
             if frame in strained:
                 own.append(position)

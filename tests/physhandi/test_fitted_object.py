@@ -77,6 +77,8 @@ def test_the_world_is_that_of_the_sequence(tmp_path: Path) -> None:
 
 
 AT = 14
+STRENGTH = 2.0
+"""Tension at which most grips of the run slip [N]."""
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +133,50 @@ def shifted(restarted, tmp_path_factory) -> Run:
     return run
 
 
+@pytest.fixture(scope="module")
+def slipping(shifted, tmp_path_factory) -> Run:
+    """The same, where most grips slip."""
+    folder = tmp_path_factory.mktemp("slipping") / "sheet"
+    shutil.copytree(shifted.folder, folder)
+    run = Run.open(folder)
+    path = run.out / SequenceFiles("lift").restart
+    state = Restart.from_tensors(load_file(path))
+    save_file(replace(state, grip_strength=STRENGTH).to_tensors(), path)
+    return run
+
+
+def test_springs_of_every_frame_are_those_that_are_left_when_grips_have_slipped(
+    shifted, slipping, tmp_path: Path
+) -> None:
+    firm, rollout = (FittedObject.of(each, "lift").simulate() for each in (shifted, slipping))
+    assert rollout.restart is not None
+    assert rollout.restart.grip_strength == pytest.approx(STRENGTH)
+    np.testing.assert_array_equal(rollout.position[: AT + 2], firm.position[: AT + 2])
+    assert rollout.frame_distance(firm, rollout.ready - 1) > 1e-4
+    own = rollout.model.object_spring_count
+    last = rollout.ready - 1
+    # Frames may be asked for in any order.
+    springs = {frame: rollout.model_in(frame) for frame in (last, AT + 1, *range(AT + 2, last))}
+    for frame in range(AT + 1, last + 1):
+        is_first = frame == AT + 1
+        velocity = rollout.restart.velocity if is_first else rollout.velocity[frame - 1]
+        one_frame = Simulator(springs[frame], rollout.parameters)
+        one_frame.reset(rollout.sprung_nodes(frame - 1), velocity)
+        one_frame.step_frame(frame, *rollout.control[frame - 1 : frame + 1])
+        np.testing.assert_allclose(
+            one_frame.position.numpy(), rollout.sprung_nodes(frame), atol=2e-6
+        )
+    lengths = np.stack([springs[frame].rest_length for frame in range(AT + 1, last + 1)])
+    np.testing.assert_array_equal(lengths[:, :own], np.tile(lengths[0, :own], (len(lengths), 1)))
+    assert (lengths[1:, own:] != lengths[:-1, own:]).any(axis=1).all()
+    means = rollout.frame_means(lambda model, *_: model.rest_length)
+    np.testing.assert_allclose(means[AT + 1 :], lengths, rtol=1e-5)
+    arrays = rollout.restart_arrays()
+    np.testing.assert_array_equal(arrays["restart_rest_length"], lengths[0])
+    assert arrays["restart_grip_strength"] == pytest.approx([STRENGTH])
+    np.testing.assert_array_less(arrays["restart_shortest"], rollout.model.rest_length + 1e-9)
+
+
 def test_strain_and_force_are_those_of_springs_beside_the_nodes(run, shifted) -> None:
     plain, rollout = (FittedObject.of(each, "lift").simulate() for each in (run, shifted))
     assert rollout.restart is not None
@@ -177,9 +223,20 @@ def test_a_rollout_goes_on_from_where_shifted_nodes_are_seen(shifted, frame: int
     assert np.abs(lengths - 1.0).max() > 0.01
 
 
+@pytest.mark.parametrize("strength", [0.0, STRENGTH], ids=["firm", "slipping"])
 @pytest.mark.parametrize("frame", [0, 5, AT, AT + 1, 17])
-def test_a_rollout_goes_on_from_any_frame_as_it_went_on(restarted, frame: int) -> None:
+def test_a_rollout_goes_on_from_any_frame_as_it_went_on(
+    restarted, frame: int, strength: float
+) -> None:
     rollout = FittedObject.of(restarted, "lift").simulate()
+    assert rollout.restart is not None
+    if strength:
+        restart = replace(rollout.restart, grip_strength=strength)
+        simulator = Simulator(rollout.model, rollout.parameters)
+        motion = simulator.rollout(rollout.control, restart)
+        assert np.abs(motion.position - rollout.position).max() > 1e-4
+        state = {"position": motion.position, "velocity": motion.velocity}
+        rollout = replace(rollout, restart=restart, **state)
     model, state = rollout.going_on(frame)
     simulator = Simulator(model, rollout.parameters)
     simulator.reset(*state)

@@ -189,6 +189,7 @@ def test_contacts_over_time_are_stored_and_kept_with_other_radii(
     assert object_.fitted.restart is not None
     assert object_.fitted.restart.shifts_nodes
     assert object_.fitted.restart.averages_in_air
+    assert object_.fitted.restart.grip_strength > 0.0
     assert model.virtual_spring_count > 0
     assert set(model.attached[:, 0].tolist()) == {1}
     assert set(model.attached[:, 1].tolist()) == {NEVER}

@@ -14,12 +14,13 @@ import numpy as np
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import SceneData
-from physhandi.data.exporters.twin import Twin
+from physhandi.data.exporters.twin import SLIPPED, Twin
 
 _SMALLEST_BALL = 1e-3
 """Radius of a node that touches the ground with itself [m]."""
 
-_PLAY = '''\
+_PLAY = (
+    '''\
 """Simulates scene.xml along the hand's motion and compares it with PhysHanDI's own rollout.
 
 pip install mujoco numpy; python play.py. In other programs: ``for position in play(): ...``
@@ -30,6 +31,11 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+
+
+'''
+    + SLIPPED
+    + '''
 
 
 def play(folder=Path(__file__).parent):
@@ -47,8 +53,8 @@ def play(folder=Path(__file__).parent):
         if frame == motion["restart_frame"] + 1:  # Prediction starts from an observed state.
             moved[:] = motion["restart_position"] - node
             data.qvel[:] = motion["restart_velocity"].ravel()
-            model.tendon_lengthspring[:] = motion["restart_rest_length"][:, None]
-            stiffness = motion["restart_stiffness"]
+            rest, stiffness = motion["restart_rest_length"], motion["restart_stiffness"]
+            model.tendon_lengthspring[:] = rest[:, None]
             model.geom_pos[1:, 2] = motion["restart_ball_height"]
             before = motion["restart_control"]
         acts = (motion["spring_first"] < frame) & (frame <= motion["spring_last"])
@@ -58,6 +64,11 @@ def play(folder=Path(__file__).parent):
             part = step / motion["substeps"]
             data.mocap_pos[:] = (1 - part) * before + part * control[frame]
             mujoco.mj_step(model, data)
+        if frame > motion["restart_frame"]:
+            data.mocap_pos[:] = control[frame]
+            mujoco.mj_fwdPosition(model, data)
+            rest, stiffness = slipped(rest, stiffness, data.ten_length, acts, motion)
+            model.tendon_lengthspring[:] = rest[:, None]
         # What the fit had missed, by which nodes were seen beside where springs have them.
         yield node + moved + (frame > motion["restart_frame"]) * motion["restart_node_shift"]
 
@@ -70,6 +81,7 @@ if __name__ == "__main__":
         travel = np.linalg.norm(rollout[frame] - rollout[0], axis=-1).mean()
         print(f"frame {frame}: moved by {1e3 * travel:.1f} mm, {1e3 * distance:.1f} mm from ours")
 '''
+)
 
 
 def mjcf_files(scene: SceneData) -> Iterator[tuple[str, bytes]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import SceneData
-from physhandi.data.exporters.twin import Twin
+from physhandi.data.exporters.twin import SLIPPED, Twin
 
 _STEPS_PER_SUBSTEP = 4
 """Steps that Newton takes for one of ours: the ground is stiff, and few steps bounce unevenly."""
@@ -28,7 +28,8 @@ _ARRIVALS = 64
 _BOUNCE_STEPS = 200
 """More than a bounce takes: 50 for the softest ground."""
 
-_PLAY = '''\
+_PLAY = (
+    '''\
 """Simulates model.npz along the hand's motion in Newton, compared with PhysHanDI's own rollout.
 
 pip install newton; python play.py. In other programs: ``for position in play(): ...``
@@ -76,6 +77,11 @@ def build(folder=Path(__file__).parent):
     return model, contacts
 
 
+'''
+    + SLIPPED
+    + '''
+
+
 def play(folder=Path(__file__).parent):
     """Yield the object's nodes (node 3) [m] of frame after frame."""
     motion = dict(np.load(folder / "motion.npz"))  # Else each use reads the file.
@@ -98,14 +104,15 @@ def play(folder=Path(__file__).parent):
     with wp.ScopedCapture(model.device) as recorded:
         two_steps()
     stiffness, damping = motion["stiffness"], motion["damping"]
+    ends = model.spring_indices.numpy().reshape(-1, 2).T
     yield place[:count].copy()
     for frame in range(1, len(control)):
         before = control[frame - 1]
         if frame == motion["restart_frame"] + 1:  # Prediction starts from an observed state.
             place[:count] = motion["restart_position"]
             speed[:count] = motion["restart_velocity"]
-            model.spring_rest_length.assign(motion["restart_rest_length"])
-            stiffness = motion["restart_stiffness"]
+            rest, stiffness = motion["restart_rest_length"], motion["restart_stiffness"]
+            model.spring_rest_length.assign(rest)
             radius = np.concatenate([motion["restart_clearance"], np.zeros(len(before))])
             model.particle_radius.assign(radius)
             before = motion["restart_control"]
@@ -125,6 +132,11 @@ def play(folder=Path(__file__).parent):
         for _ in range(int(motion["substeps"]) // 2):
             wp.capture_launch(recorded.graph)
         place, speed = now.particle_q.numpy().copy(), now.particle_qd.numpy().copy()
+        if frame > motion["restart_frame"]:
+            first, second = np.concatenate([place[:count], control[frame]])[ends]
+            length = np.linalg.norm(first - second, axis=-1)
+            rest, stiffness = slipped(rest, stiffness, length, acts, motion)
+            model.spring_rest_length.assign(rest)
         # What the fit had missed, by which nodes were seen beside where springs have them.
         yield place[:count] + (frame > motion["restart_frame"]) * motion["restart_node_shift"]
 
@@ -138,6 +150,7 @@ if __name__ == "__main__":
         travel = np.linalg.norm(rollout[frame] - rollout[0], axis=-1).mean()
         print(f"frame {frame}: moved by {1e3 * travel:.1f} mm, {1e3 * distance:.2f} mm from ours")
 '''
+)
 
 
 def newton_files(scene: SceneData) -> Iterator[tuple[str, bytes]]:

@@ -14,6 +14,17 @@ from numpy import ndarray
 from physhandi.data.exporters.scene_data import SceneData
 from physhandi.errors import UsageError
 
+SLIPPED = '''def slipped(rest, stiffness, length, holds, motion):
+    """Let springs slip that are pulled or pressed harder than they hold: they go on with that."""
+    force = stiffness * rest  # For a strain of 1.
+    strain, strength = length / rest - 1, motion["grip_strength"]
+    slips = holds & (force * np.abs(strain) > strength)
+    borne = np.divide(strength, force, out=np.zeros_like(rest), where=slips) * np.sign(strain)
+    after = np.maximum(length / (1 + borne), motion["shortest_rest_length"])
+    rest = np.where(slips, after, rest)
+    return rest, force / rest'''
+"""Source of what `Restart.slipped` computes, for the programs that play a twin."""
+
 
 class Twin:
     """Nodes, springs and control nodes of a scene, and what changes of them over time."""
@@ -136,6 +147,9 @@ class Twin:
             return arrays
         frame = int(model["restart_frame"][0])
         after = model["restart_rest_length"].astype(np.float64)
+        strength = np.full(len(self.ends), np.inf)
+        if model["restart_grip_strength"][0] > 0.0:
+            strength[virtual] = self.mass * float(model["restart_grip_strength"][0])
         beside = model.get("restart_node_shift", np.zeros(3)).astype(np.float64)
         return arrays | {
             "restart_frame": np.array(frame),
@@ -145,5 +159,7 @@ class Twin:
             "restart_velocity": model["restart_velocity"].astype(np.float64),
             "restart_rest_length": after,
             "restart_stiffness": self._stiffness(after),
+            "grip_strength": strength,
+            "shortest_rest_length": model.get("restart_shortest", after).astype(np.float64),
             "restart_clearance": model["restart_clearance"].astype(np.float64),
         }

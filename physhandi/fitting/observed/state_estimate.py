@@ -30,6 +30,7 @@ def observed_state(
     *,
     device: str = "cpu",
     strain_time: float = 0.0,
+    grip_strength: float = 0.0,
 ) -> Restart:
     """Estimate position and velocity of the nodes in a frame.
 
@@ -49,6 +50,8 @@ def observed_state(
         device: Warp device.
         strain_time: Time until the frame over which the strain of springs in the air is
             averaged [s].
+        grip_strength: How many times the object's weight all virtual springs that act in the frame
+            pull together when each of them slips; 0 if none ever does.
 
     Raises:
         MissingInputError: If the frame shows no track whose place on the object is known.
@@ -69,7 +72,17 @@ def observed_state(
         strain_frames=max(1, round(strain_time * parameters.simulated_frame_rate)),
         averages_in_air=True,
         shifts_nodes=True,
+        grip_strength=_limit(grip_strength, model, parameters, frame),
     )
+
+
+def _limit(
+    strength: float, model: SpringMassModel, parameters: SimulationParameters, frame: int
+) -> float:
+    """Share some times the object's weight among the virtual springs that act in a frame [N]."""
+    weight = model.node_count * max(parameters.gravity, 0.0)  # A node weighs 1 kg.
+    springs = np.count_nonzero(model.acts_in(frame)[model.object_spring_count :])
+    return float(np.float32(strength * weight / max(springs, 1)))
 
 
 def _seen(motion: Rollout, observation: ObjectObservation, frame: int) -> Float[ndarray, "node 3"]:

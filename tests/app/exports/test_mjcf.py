@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.physics.hanging_node import hanging_node, scene_of, unpacked
+from support.physics.hanging_node import hanging_node, scene_of, slipping_node, unpacked
 from support.server.server_world import World
 
 from app.cli import main
@@ -71,6 +71,14 @@ def test_springs_gravity_and_the_ground_are_those_of_closed_forms(
     assert 3 < flies.sum() < 10
     np.testing.assert_allclose(position[flies, 1][:, [0, 2]], expected[flies], atol=2e-3)
     assert position[-1, 1, 2] == pytest.approx(0.05, abs=4e-3)
+
+
+def test_grips_slip_as_in_our_rollout(tmp_path: Path) -> None:
+    rollout = slipping_node()
+    position = played(unpacked(mjcf_files(scene_of(rollout, 0.03)), tmp_path / "twin"))
+    np.testing.assert_allclose(position[:, 0], rollout.position[:, 0], atol=1e-3)
+    firm = slipping_node(strength=0.0)
+    assert np.abs(firm.position - rollout.position)[-1, 0, 2] > 0.01
 
 
 def test_a_spring_holds_only_while_it_is_attached(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.physics.hanging_node import hanging_node, scene_of, unpacked
+from support.physics.hanging_node import hanging_node, scene_of, slipping_node, unpacked
 from support.server.server_world import World
 
 from app.cli import main
@@ -62,6 +62,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "dragged": hanging_node(settings=air, **dashpot),
         "braked": hanging_node(settings=air | {"use_control_velocity": False}, **dashpot),
     }
+    rollouts["slipping"] = slipping_node()
     for name, rollout in rollouts.items():
         unpacked(newton_files(scene_of(rollout)), folder / name)
     unpacked(newton_files(scene_of(rollouts["hanging"], 0.03)), folder / "light")
@@ -90,6 +91,16 @@ def test_the_bundled_towel_folds_in_newton_as_in_our_rollout(played: Path) -> No
         first = int(motion["restart_frame"]) + 1
         beside = np.linalg.norm(motion["restart_node_shift"], axis=1).mean()
     assert distance[first : first + 3].max() < 3e-4 < 0.1 * beside
+
+
+@needs_newton
+@pytest.mark.slow
+def test_grips_slip_as_in_our_rollout(played: Path) -> None:
+    position = np.load(played / "slipping" / "position.npy")
+    expected = slipping_node()
+    np.testing.assert_allclose(position[:, 0], expected.position[:, 0], atol=5e-4)
+    firm = slipping_node(strength=0.0)
+    assert np.abs(firm.position - expected.position)[-1, 0, 2] > 0.01
 
 
 @needs_newton

@@ -118,6 +118,19 @@ def test_strain_is_averaged_over_a_time() -> None:
         assert found.averages_in_air
 
 
+def test_grips_share_some_times_the_weight_of_the_object() -> None:
+    model, parameters = as_model(SCENE)
+    shift = observed(np.full((8, 3), 0.002))
+    found = observed_state(model, parameters, SCENE.control, shift, LAST, grip_strength=3.0)
+    # Eight nodes of 1 kg, held by five springs.
+    assert found.grip_strength == pytest.approx(3.0 * 8 * 9.81 / 5)
+    attached = np.array([[0, 99], [0, 99], [0, 1], [0, 99], [LAST, 99]], np.int32)
+    fewer = replace(model, attached=attached)
+    found = observed_state(fewer, parameters, SCENE.control, shift, LAST, grip_strength=3.0)
+    assert found.grip_strength == pytest.approx(3.0 * 8 * 9.81 / 3)
+    assert estimate(shift).grip_strength == 0.0
+
+
 def test_without_a_track_there_is_no_state() -> None:
     seen = np.ones((4, 8), bool)
     seen[LAST] = False

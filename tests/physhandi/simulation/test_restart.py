@@ -1,5 +1,6 @@
 """A rollout that continues from another state: against the oracle, closed forms and bits."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -50,7 +51,29 @@ def continued_oracle(scene: Scene, restart: Restart, frame: int = AT) -> np.ndar
         clearance=np.where(own[:, 2] < 0.003, restart.position[:, 2].astype(float), 0.0),
         rest_shape=scene.node,
     )
-    return simulate(later)[0]
+    return (
+        slipping_oracle(later, restart.grip_strength)
+        if restart.grip_strength
+        else simulate(later)[0]
+    )
+
+
+def slipping_oracle(scene: Scene, strength: float) -> np.ndarray:
+    """Simulate one frame after the other in float64; springs of controls slip between them."""
+    motion, is_virtual = [scene.node], scene.springs.max(axis=1) >= len(scene.node)
+    for frame in range(1, len(scene.control)):
+        position, velocity = simulate(replace(scene, control=scene.control[frame - 1 : frame + 1]))
+        motion.append(position[1])
+        point = np.vstack([position[1], scene.control[frame]])
+        rest = scene.rest.copy()
+        for spring in np.flatnonzero(is_virtual):
+            length = math.dist(*point[scene.springs[spring]])
+            tension = scene.stiffness[spring] * (length - rest[spring]) / rest[spring]
+            if abs(tension) > strength:
+                bears = math.copysign(strength, tension)
+                rest[spring] = length / (1.0 + bears / scene.stiffness[spring])
+        scene = replace(scene, node=position[1], velocity=velocity[1], rest=rest)
+    return np.stack(motion)
 
 
 @pytest.mark.parametrize("distance", [None, 0.002], ids=["engine", "self_collision"])
@@ -255,6 +278,77 @@ def test_a_weight_that_swings_goes_on_with_what_it_bears_on_average(device: str)
     np.testing.assert_allclose(kept[period + 1 :], low[None].repeat(5, axis=0), atol=1e-3)
     # With the strain of the last frame it is pulled by 5 N too much: it swings up by 0.1 (1 - cos).
     assert kicked[period + 5, 0, 2] - low[0, 2] == pytest.approx(0.1, abs=2e-3)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["pulled", "pressed"])
+def test_a_grip_slips_and_bears_what_it_is_strong_enough_for(device: str, side: float) -> None:
+    model, parameters, _ = hanging()
+    # The same weight also stands on a spring of 1 m, which it makes as much shorter.
+    node = np.float32([[0.0, 0.0, -HANGING if side > 0 else 2.0 - HANGING]])
+    model = replace(model, object_node=node)
+    restart = Restart(frame=AT, position=node, velocity=np.zeros_like(node))
+    control = np.zeros((100, 1, 3), np.float32)
+    simulator = Simulator(model, parameters, device)
+
+    def falls(strength: float) -> np.ndarray:
+        rollout = simulator.rollout(control, replace(restart, grip_strength=strength))
+        return (node[0, 2] - rollout.position[AT:, 0, 2]).astype(float)
+
+    np.testing.assert_allclose(falls(10.0), 0.0, atol=2e-6)
+    np.testing.assert_array_equal(falls(10.0), falls(0.0))
+    # It bears all of the weight for one more millisecond, and then 4 N of 9.81.
+    time = 1e-3 * np.maximum(np.arange(len(control) - AT) - 1, 0)
+    expected = 0.5 * (GRAVITY - 4.0) * time * (time + 1e-3)
+    assert expected[-1] > 0.02
+    np.testing.assert_allclose(falls(4.0), expected, rtol=0.02, atol=1e-5)
+    assert not np.allclose(falls(3.0), expected, rtol=0.1)
+
+
+def test_frames_in_which_grips_slip_agree_with_the_oracle(device: str) -> None:
+    scene = cube_scene()
+    rigid = another_state(scene, 0)
+    restart = replace(rigid, grip_strength=2.0)
+    rollout = Simulator(*as_model(scene), device=device).rollout(scene.control, restart)
+    expected, held = (continued_oracle(scene, each, 0) for each in (restart, rigid))
+    np.testing.assert_allclose(rollout.position[1:], expected[1:], atol=2e-6)
+    # They slip at the end of a frame: the first one is the same.
+    np.testing.assert_allclose(held[1], expected[1], atol=1e-12)
+    assert np.abs(held[2:] - expected[2:]).max(axis=(1, 2)).min() > 1e-4
+    for other in (1.8, 2.2):
+        wrong = continued_oracle(scene, replace(rigid, grip_strength=other), 0)
+        assert np.abs(wrong - expected).max() > 2e-5
+
+
+def test_rest_lengths_are_such_that_a_grip_bears_its_strength() -> None:
+    node = np.zeros((2, 3), np.float32)
+    model = SpringMassModel(
+        object_node=node,
+        initial_velocity=node,
+        spring_nodes=np.array([[0, 1], [0, 2], [0, 3], [1, 2], [0, 4], [1, 5]], np.int32),
+        rest_length=np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0], np.float32),
+        stiffness=np.array([50.0, 25.0, 25.0, 25.0, 25.0, 25.0], np.float32),
+        damping=np.ones(6, np.float32),
+        object_spring_count=1,
+        control_count=4,
+        attached=np.array([[0, 99], [0, 99], [3, 99], [0, 99], [0, 99]], np.int32),
+    )
+    parameters = SimulationParameters(stiffness_scale=2.0)
+    # Pulled by 10 N and pressed by 10; pulled by 4; and pulled by 10, but not attached yet.
+    control = np.zeros((4, 3), np.float32)
+    control[:, 0] = 1.2, 0.8, 1.08, 0.1
+    restart = Restart(frame=0, position=node, velocity=node, grip_strength=5.0)
+    place = np.float32([[0, 0, 0], [0, 0, 0]])
+    now = np.ones(6, np.float32)
+    later = restart.slipped(model, parameters, now, 1, place, control)
+    tension = 50.0 * (np.abs(control[[0, 1, 2], 0]) / later[[1, 2, 4]] - 1.0)
+    np.testing.assert_allclose(tension, [5.0, -5.0, 4.0], rtol=1e-5)
+    assert later[[0, 3, 4]].tolist() == [1.0, 1.0, 1.0]
+    # The last is pressed by 45 N: it may get no shorter than automatic substeps allow for.
+    assert later[5] == pytest.approx(0.64)
+    attached = restart.slipped(model, parameters, now, 4, place, control)
+    assert attached[3] == pytest.approx(1.2 / 1.1)
+    bound = replace(restart, grip_strength=0.0)
+    assert bound.slipped(model, parameters, now, 4, place, control) is now
 
 
 def test_what_follows_a_restart_is_the_same_bits_and_leaves_nothing_behind(device: str) -> None:

@@ -11,6 +11,8 @@ from physhandi.data.object_mass import given_mass
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import Restart
+from physhandi.simulation.simulator import Simulator
 
 
 def hanging_node(
@@ -42,6 +44,25 @@ def hanging_node(
         SimulationParameters(**(parameters | (settings or {}))),
         control,
     )
+
+
+def slipping_node(strength: float = 6.0) -> ObjectRollout:
+    """The same, simulated: from frame 2 on what holds the node slips, as long as that bears less.
+
+    The spring pulls by up to 20 N.
+    """
+    made = hanging_node()
+    node = made.model.object_node
+    restart = Restart(
+        frame=2,
+        position=node,
+        velocity=np.zeros_like(node),
+        shifts_nodes=True,
+        grip_strength=strength,
+    )
+    motion = Simulator(made.model, made.parameters).rollout(made.control, restart)
+    state = {"position": motion.position, "velocity": motion.velocity}
+    return replace(made, restart=restart, **state)
 
 
 def scene_of(rollout: ObjectRollout, kilograms: float | None = None) -> SceneData:
