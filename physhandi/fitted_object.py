@@ -350,8 +350,9 @@ class FittedObject:
         What is left out has its fitted value, so that ``rollout(log_stiffness=log(x))`` moves as
         ``simulate(stiffness=x)`` does, but it does not restart: all frames follow from the initial
         state. To predict, give `initial_position`, `initial_velocity` and the control nodes from a
-        frame after ``fitted.restart.frame`` on, all as ``fitted.going_on(frame)`` tells, to a
-        `FittedObject` of the model that it gives.
+        frame after ``fitted.restart.frame`` on, all as ``fitted.going_on(frame)`` tells, and
+        ``friction`` of ``fitted.parameters_in(frame + 1)`` to a `FittedObject` of the model that it
+        gives.
 
         Args:
             log_stiffness: Natural logarithm of the stiffness [log N]. One number is that of

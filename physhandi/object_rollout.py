@@ -140,13 +140,21 @@ class ObjectRollout:
             self._continued[reached + 1] = after
         return self._continued[frame]
 
+    def parameters_in(self, frame: int) -> SimulationParameters:
+        """Get the parameters on the way to a frame: a restart may leave less friction."""
+        restart = self.restart
+        if restart is None or frame <= restart.frame or restart.friction_share == 1.0:
+            return self.parameters
+        return self.parameters.replace(friction=restart.friction_share * self.parameters.friction)
+
     def going_on(self, frame: int) -> tuple[SpringMassModel, NodeState]:
         """Get what is needed to go on from a frame in another way.
 
         Returns:
             The model, whose springs have the strain that they have in the frame, and those that are
             attached on the way to the next frame for good; positions and velocities of the nodes
-            [m, m/s]. Where velocities are not known, they are differences of positions.
+            [m, m/s]. Where velocities are not known, they are differences of positions. With
+            `parameters_in` of the next frame it goes on as this does.
         """
         restart = self.restart
         is_own = restart is None or frame <= restart.frame

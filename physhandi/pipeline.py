@@ -399,6 +399,7 @@ def _store_restart(
             device=device,
             strain_time=config.prediction.strain_time,
             grip_strength=config.prediction.grip_strength,
+            keeps_sliding=config.prediction.keeps_sliding,
         )
     except MissingInputError as error:
         raise MissingInputError(f"Sequence '{sequence.name}': {error}") from error

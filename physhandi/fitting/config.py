@@ -396,6 +396,9 @@ class PredictionConfig(Settings, frozen=True, kw_only=True):
     grip_strength: Annotated[float, Meta(ge=0.0, le=1e9)] = 30.0
     """How many times its weight the object may be pulled by all virtual springs that act in the
     last fitted frame, shared by them evenly. One that is pulled harder slips; 0 if none does."""
+    keeps_sliding: bool = True
+    """Whether less friction is left where what lies on the ground was seen to slide in the last
+    fitted frames and would be stuck: as much as it goes on with as fast."""
 
 
 class PipelineConfig(Settings, frozen=True, kw_only=True):

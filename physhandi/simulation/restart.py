@@ -11,7 +11,9 @@ So springs may go on where the rollout has them, and every node is shown as far 
 was seen there: what a fit missed is a shift, not a force.
 
 A spring between hand and object holds however hard it is pulled. Where nobody observes any more
-whether a finger slips, it does beyond a tension (`grip_strength`).
+whether a finger slips, it does beyond a tension (`grip_strength`). And what lies still tells no
+more of friction than that it is enough; if it was seen to slide at last, less is left of it
+(`friction_share`).
 """
 
 from collections.abc import Mapping
@@ -42,6 +44,7 @@ _OPTIONAL = {
     "averages_in_air": 0,
     "shifts_nodes": 0,
     "grip_strength": 0.0,
+    "friction_share": 1.0,
 }
 """Single numbers that a stored restart may lack, and what they are then."""
 
@@ -108,6 +111,9 @@ class Restart:
     grip_strength: float = 0.0
     """Tension beyond which a virtual spring slips at the end of a frame after the restart (see
     `slipped`), as a finger does that friction no longer holds [N]; 0 if none ever slips."""
+    friction_share: float = 1.0
+    """Part of the ground's friction that is left after the restart. Frames in which what lies does
+    not move tell no more than a lower bound of it."""
 
     def __post_init__(self) -> None:
         if self.frame < 0:
@@ -116,6 +122,8 @@ class Restart:
             raise ValueError(
                 f"grip_strength is {self.grip_strength}; expected 0 or more, and finite."
             )
+        if not 0.0 <= self.friction_share <= 1.0:
+            raise ValueError(f"friction_share is {self.friction_share}; expected 0 to 1.")
         if self.strain_frames < 1:
             raise ValueError(f"strain_frames is {self.strain_frames}; expected 1 or more.")
         for name in ("position", "velocity"):
@@ -160,7 +168,7 @@ class Restart:
         """
         rest = model.rest_length.astype(np.float64)
         own = position[-1]
-        rests = _rests_on(model, parameters.ground_height, own)
+        rests = rests_on(model, parameters.ground_height, own)
         before = rest * (1.0 + self._kept_strain(model, position, control, rests))
         shift = self.hand_shift(model, own)
         moved = control[-1] if shift is None else control[-1] + shift
@@ -335,6 +343,7 @@ class Restart:
             averages_in_air=bool(single["averages_in_air"][0]),
             shifts_nodes=bool(single["shifts_nodes"][0]),
             grip_strength=float(single["grip_strength"][0]),
+            friction_share=float(single["friction_share"][0]),
         )
 
 
@@ -348,7 +357,7 @@ def shortest_rest_lengths(
     return np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
 
 
-def _rests_on(
+def rests_on(
     model: SpringMassModel, ground_height: float | None, position: Float[ndarray, "node 3"]
 ) -> Bool[ndarray, " node"]:
     """Say which nodes lie on the ground."""

@@ -78,6 +78,8 @@ class Simulator:
         self.control_end = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
         self.first_divergence = self.array(np.array([NO_DIVERGENCE]), wp.int32)
         self._held: ndarray | None = None
+        self._is_smoother = False
+        """Whether a restart left less friction than the parameters say."""
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
         self._candidates = 0
         self._collision: SelfCollision | None = None
@@ -108,6 +110,7 @@ class Simulator:
             )
         self.parameters = parameters
         self.world.assign(world_array([parameters]))
+        self._is_smoother = False
 
     def override_world(self, **values: float) -> None:
         """Set fields of the kernels' `World` directly, bounds unchecked, until the next change."""
@@ -156,6 +159,8 @@ class Simulator:
         self.rest_length.assign(self.model.rest_length)
         self.clearance.assign(self.model.clearance)
         self.first_divergence.fill_(NO_DIVERGENCE)
+        if self._is_smoother:
+            self.set_parameters(self.parameters)
         if self.hand_contact is not None:
             self.hand_contact.shift(None)
         if self.rod is not None:
@@ -187,6 +192,9 @@ class Simulator:
         self.reset(restart.start_of_springs(position[-1]), restart.velocity)
         self.rest_length.assign(model.rest_length)
         self.clearance.assign(model.clearance)
+        if restart.friction_share != 1.0:
+            self.override_world(friction=restart.friction_share * self.parameters.friction)
+            self._is_smoother = True
         if self.hand_contact is not None:
             self.hand_contact.shift(hand_shift)
         return hand_shift, restart.node_shift(position[-1])

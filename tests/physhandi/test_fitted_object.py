@@ -231,14 +231,17 @@ def test_a_rollout_goes_on_from_any_frame_as_it_went_on(
     rollout = FittedObject.of(restarted, "lift").simulate()
     assert rollout.restart is not None
     if strength:
-        restart = replace(rollout.restart, grip_strength=strength)
+        restart = replace(rollout.restart, grip_strength=strength, friction_share=0.5)
         simulator = Simulator(rollout.model, rollout.parameters)
         motion = simulator.rollout(rollout.control, restart)
         assert np.abs(motion.position - rollout.position).max() > 1e-4
         state = {"position": motion.position, "velocity": motion.velocity}
         rollout = replace(rollout, restart=restart, **state)
     model, state = rollout.going_on(frame)
-    simulator = Simulator(model, rollout.parameters)
+    parameters = rollout.parameters_in(frame + 1)
+    share = 0.5 if strength and frame >= AT else 1.0
+    assert parameters.friction == share * rollout.parameters.friction
+    simulator = Simulator(model, parameters)
     simulator.reset(*state)
     np.testing.assert_array_equal(simulator.position.numpy(), rollout.position[frame])
     simulator.step_frame(1, rollout.control[frame], rollout.control[frame + 1])

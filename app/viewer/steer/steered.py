@@ -104,7 +104,7 @@ def begin_motion(
     return SteeredMotion(
         model=model,
         start=start,
-        parameters=rollout.parameters,
+        parameters=rollout.parameters_in(frame + 1),
         control=control,
         hands=steered,
         is_edited=bool(rollout.edits),

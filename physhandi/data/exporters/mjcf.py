@@ -56,6 +56,7 @@ def play(folder=Path(__file__).parent):
             rest, stiffness = motion["restart_rest_length"], motion["restart_stiffness"]
             model.tendon_lengthspring[:] = rest[:, None]
             model.geom_pos[1:, 2] = motion["restart_ball_height"]
+            model.geom_friction[:, 0] *= motion["friction_share"]
             before = motion["restart_control"]
         acts = (motion["spring_first"] < frame) & (frame <= motion["spring_last"])
         model.tendon_stiffness[:] = acts * stiffness

@@ -100,9 +100,13 @@ def play(folder=Path(__file__).parent):
             solver.step(start, end, None, contacts, dt)
             wp.map(wp.add, end.particle_q, moves, out=end.particle_q)
 
+    def recorded():
+        with wp.ScopedCapture(model.device) as capture:
+            two_steps()
+        return capture.graph
+
     two_steps()  # Compiles what is recorded next.
-    with wp.ScopedCapture(model.device) as recorded:
-        two_steps()
+    graph = recorded()
     stiffness, damping = motion["stiffness"], motion["damping"]
     ends = model.spring_indices.numpy().reshape(-1, 2).T
     yield place[:count].copy()
@@ -116,6 +120,10 @@ def play(folder=Path(__file__).parent):
             radius = np.concatenate([motion["restart_clearance"], np.zeros(len(before))])
             model.particle_radius.assign(radius)
             before = motion["restart_control"]
+            if contacts is not None:  # Their friction is the mean of what touches.
+                model.soft_contact_mu *= float(motion["friction_share"])
+                model.shape_material_mu.fill_(model.soft_contact_mu)
+                graph = recorded()
         # Particles without mass go on with their speed, unless dashpots are not to feel it.
         place[count:], speed[count:] = before, 0.0
         way = np.zeros_like(place)
@@ -130,7 +138,7 @@ def play(folder=Path(__file__).parent):
         model.spring_stiffness.assign(acts * stiffness)
         model.spring_damping.assign(acts * damping)
         for _ in range(int(motion["substeps"]) // 2):
-            wp.capture_launch(recorded.graph)
+            wp.capture_launch(graph)
         place, speed = now.particle_q.numpy().copy(), now.particle_qd.numpy().copy()
         if frame > motion["restart_frame"]:
             first, second = np.concatenate([place[:count], control[frame]])[ends]

@@ -160,6 +160,7 @@ class Twin:
             "restart_rest_length": after,
             "restart_stiffness": self._stiffness(after),
             "grip_strength": strength,
+            "friction_share": np.array(float(model["restart_friction_share"][0])),
             "shortest_rest_length": model.get("restart_shortest", after).astype(np.float64),
             "restart_clearance": model["restart_clearance"].astype(np.float64),
         }

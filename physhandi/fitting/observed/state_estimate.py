@@ -4,21 +4,35 @@ A fit leaves residuals, and a simulation of later frames carries them along. The
 to where the tracks were seen; where the springs go on from is said in `simulation.restart`.
 """
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.errors import MissingInputError
+from physhandi.errors import MissingInputError, SimulationDivergedError
 from physhandi.metrics.baselines import last_residual
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.restart import Restart
+from physhandi.simulation.restart import Restart, rests_on
 from physhandi.simulation.simulator import Rollout, Simulator
 
 VELOCITY_FRAMES = 3
 """Last frames over which the velocity is averaged. Over two of them the noise of tracks would be
 twice as large; the more there are, the farther it lags behind a motion that changes."""
+FEWEST_LYING = 0.1
+"""Part of the nodes that has to lie on the ground for its sliding to tell something."""
+SLIDING = 0.0125
+"""Least speed at which what lies is taken to slide [m/s]; tracks of toys that stand still, whose
+few lying nodes are seen from above, move by up to 0.01."""
+STUCK = 0.25
+"""What lies is stuck if it would go on by less than this part of the way that was seen."""
+LEAST_FRICTION = 1.0 / 32.0
+"""Least part of the friction that is left."""
+HALVINGS = 6
+"""How often the interval between the least part and all of it is halved, on a logarithmic scale."""
 
 
 def observed_state(
@@ -31,6 +45,7 @@ def observed_state(
     device: str = "cpu",
     strain_time: float = 0.0,
     grip_strength: float = 0.0,
+    keeps_sliding: bool = False,
 ) -> Restart:
     """Estimate position and velocity of the nodes in a frame.
 
@@ -44,7 +59,8 @@ def observed_state(
     Args:
         model: Fitted nodes and springs.
         parameters: Fitted parameters, in the world of the sequence.
-        control: Control nodes in every frame [m].
+        control: Control nodes in every frame [m]; of those after `frame`, `VELOCITY_FRAMES` tell
+            whether what slides goes on.
         observation: What was seen; only frame 0, the frame itself and those before it are read.
         frame: The frame.
         device: Warp device.
@@ -52,6 +68,8 @@ def observed_state(
             averaged [s].
         grip_strength: How many times the object's weight all virtual springs that act in the frame
             pull together when each of them slips; 0 if none ever does.
+        keeps_sliding: Whether less friction is left where what lies on the ground was seen to slide
+            and would be stuck: as much as it goes on with as fast as it was seen.
 
     Raises:
         MissingInputError: If the frame shows no track whose place on the object is known.
@@ -65,7 +83,7 @@ def observed_state(
     velocity = _seen_velocity(motion, observation, frame, parameters.simulated_frame_rate)
     if parameters.ground_height is not None:
         position[:, 2] = np.maximum(position[:, 2], parameters.ground_height)
-    return Restart(
+    restart = Restart(
         frame=frame,
         position=position.astype(np.float32),
         velocity=velocity.astype(np.float32),
@@ -74,6 +92,10 @@ def observed_state(
         shifts_nodes=True,
         grip_strength=_limit(grip_strength, model, parameters, frame),
     )
+    if not keeps_sliding:
+        return restart
+    share = _friction_share(Simulator(model, parameters, device), restart, motion.position, control)
+    return replace(restart, friction_share=share)
 
 
 def _limit(
@@ -83,6 +105,62 @@ def _limit(
     weight = model.node_count * max(parameters.gravity, 0.0)  # A node weighs 1 kg.
     springs = np.count_nonzero(model.acts_in(frame)[model.object_spring_count :])
     return float(np.float32(strength * weight / max(springs, 1)))
+
+
+def _friction_share(
+    simulator: Simulator,
+    restart: Restart,
+    position: Float[ndarray, "before node 3"],
+    control: Float[ndarray, "frame control 3"],
+) -> float:
+    """Find how much friction is left if what lies slides on as fast as it was seen to.
+
+    Fitted frames in which it lies still are explained by any friction that is large enough, so a
+    fit takes one that may be far too large for what follows. A part with which the motion runs away
+    counts as too small.
+
+    Args:
+        simulator: Simulates the object; its state is replaced.
+        restart: The observed state.
+        position: The rollout's own nodes up to its frame [m].
+        control: Control nodes; those of the next `VELOCITY_FRAMES` frames tell the way.
+
+    Returns:
+        The part of the friction that is left, `LEAST_FRICTION` to 1; 1 where nothing slides, or
+        slides on by itself.
+    """
+    frame, rate = restart.frame, simulator.parameters.simulated_frame_rate
+    lies = rests_on(simulator.model, simulator.parameters.ground_height, position[frame])
+    ahead = control[frame : frame + VELOCITY_FRAMES + 1]
+    if lies.mean() < FEWEST_LYING or len(ahead) < 2:
+        return 1.0
+    velocity = restart.velocity[lies].mean(axis=0, dtype=np.float64)[:2]
+    speed = np.linalg.norm(velocity)
+    if speed < SLIDING:
+        return 1.0
+    strained = restart.strained_frames
+
+    def slides(share: float) -> float:
+        less = replace(restart, friction_share=share)
+        simulator.continue_from(less, position[strained], control[strained])
+        try:
+            for number, (start, end) in enumerate(pairwise(ahead), frame + 1):
+                simulator.step_frame(number, start, end)
+                simulator.let_grips_slip(less, number, end)
+        except SimulationDivergedError:
+            return np.inf
+        way = (simulator.position.numpy() - position[frame])[lies].mean(axis=0)[:2]
+        return float(way @ velocity / speed**2 * rate / (len(ahead) - 1))
+
+    if slides(1.0) >= STUCK:
+        return 1.0
+    if slides(LEAST_FRICTION) <= 1.0:
+        return LEAST_FRICTION
+    low, high = np.log(LEAST_FRICTION), 0.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if slides(float(np.exp(middle))) > 1.0 else (low, middle)
+    return float(np.float32(np.exp(0.5 * (low + high))))
 
 
 def _seen(motion: Rollout, observation: ObjectObservation, frame: int) -> Float[ndarray, "node 3"]:

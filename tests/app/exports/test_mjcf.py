@@ -73,12 +73,14 @@ def test_springs_gravity_and_the_ground_are_those_of_closed_forms(
     assert position[-1, 1, 2] == pytest.approx(0.05, abs=4e-3)
 
 
-def test_grips_slip_as_in_our_rollout(tmp_path: Path) -> None:
+def test_grips_slip_and_less_friction_is_left_as_in_our_rollout(tmp_path: Path) -> None:
     rollout = slipping_node()
     position = played(unpacked(mjcf_files(scene_of(rollout, 0.03)), tmp_path / "twin"))
     np.testing.assert_allclose(position[:, 0], rollout.position[:, 0], atol=1e-3)
-    firm = slipping_node(strength=0.0)
+    np.testing.assert_allclose(position[:, 1, 0], rollout.position[:, 1, 0], atol=0.01)
+    firm = slipping_node(strength=0.0, share=1.0)
     assert np.abs(firm.position - rollout.position)[-1, 0, 2] > 0.01
+    assert np.abs(firm.position - rollout.position)[-1, 1, 0] > 0.03
 
 
 def test_a_spring_holds_only_while_it_is_attached(tmp_path: Path) -> None:

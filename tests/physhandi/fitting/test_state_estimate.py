@@ -131,6 +131,91 @@ def test_grips_share_some_times_the_weight_of_the_object() -> None:
     assert estimate(shift).grip_strength == 0.0
 
 
+FORCE, FRICTION, PACE = 2.0, 0.8, 0.06
+"""What pulls a weight of 1 kg over the ground [N], friction that holds it, and how fast it is seen
+to slide nevertheless [m/s]."""
+
+
+def dragged(
+    friction: float = FRICTION,
+    pace: float = PACE,
+    pull: float = FORCE,
+    lifted: int = 0,
+    frames: int = 9,
+) -> tuple[float, np.ndarray]:
+    """Give the friction that is left for a weight on the ground, and where it goes with that.
+
+    A hand pulls it by a soft spring and moves as fast as it is seen to slide.
+    """
+    rate, last = 30.0, 4
+    node = np.zeros((1 + lifted, 3))
+    node[1:, 2] = 0.3
+    time = np.arange(frames) / rate
+    control = np.zeros((frames, 1, 3))
+    control[:, 0, 0] = 1.0 + pull / 40.0 + pace * (time - last / rate)
+    scene = bare_scene(
+        node,
+        springs=[[0, 1 + lifted]],
+        rest=[1.0],
+        stiffness=[40.0],
+        damping=[0.0],
+        control=control,
+        ground=0.0,
+        gravity=9.81,
+        restitution=0.0,
+        friction=friction,
+        frame_rate=rate,
+    )
+    point = np.zeros((frames, 1 + lifted, 3), np.float32)
+    point[:] = node
+    point[:, 0, 0] = pace * np.maximum(time - 1 / rate, 0.0)
+    seen = np.ones(point.shape[:2], bool)
+    observation = ObjectObservation(
+        point=point, is_visible=seen, is_motion_valid=seen, node_of_track=np.arange(1 + lifted)
+    )
+    model, parameters = as_model(scene)
+    found, held = (
+        observed_state(model, parameters, control, observation, last, keeps_sliding=keeps)
+        for keeps in (True, False)
+    )
+    assert held.friction_share == 1.0
+    np.testing.assert_array_equal(found.position, held.position)
+    position = Simulator(model, parameters).rollout(control, found).position
+    np.testing.assert_allclose(position[: last + 1, 0, 0], 0.0, atol=1e-4 if friction > 0.3 else 1)
+    return found.friction_share, position[last:, 0, 0] - point[last, 0, 0]
+
+
+def test_what_is_seen_to_slide_slides_on_with_the_friction_that_its_pull_overcomes() -> None:
+    share, way = dragged()
+    # Friction that is as large as the pull lets it go on as fast as it was; the interval that is
+    # searched is halved six times.
+    assert share == pytest.approx(FORCE / (9.81 * FRICTION), rel=0.06)
+    np.testing.assert_allclose(way[1:4], PACE * np.arange(1, 4) / 30.0, atol=6e-4)
+    assert way[3] > 0.005
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"pace": 0.01},  # As slow as tracks of what lies still.
+        {"friction": 0.1},  # It slides by itself.
+        {"lifted": 10},  # Next to nothing of it lies.
+        {"frames": 5},  # Nothing is to be predicted.
+    ],
+    ids=["slow", "slides", "lifted", "last"],
+)
+def test_friction_stays_where_nothing_tells_that_there_is_less(settings) -> None:
+    assert dragged(**settings)[0] == 1.0
+
+
+def test_the_least_friction_is_left_where_it_holds_too_much_still() -> None:
+    # A hand that goes along beside it without a pull: any friction makes it slower.
+    share, way = dragged(pace=0.5, pull=0.0, friction=2.0)
+    assert share == 1.0 / 32.0
+    time = 3 / 30.0
+    assert way[3] == pytest.approx(0.5 * time - 0.5 * 2.0 * share * 9.81 * time**2, abs=5e-4)
+
+
 def test_without_a_track_there_is_no_state() -> None:
     seen = np.ones((4, 8), bool)
     seen[LAST] = False

@@ -304,6 +304,45 @@ def test_a_grip_slips_and_bears_what_it_is_strong_enough_for(device: str, side: 
     assert not np.allclose(falls(3.0), expected, rtol=0.1)
 
 
+def test_after_a_restart_a_part_of_the_friction_is_left_and_before_it_all(device: str) -> None:
+    node = np.zeros((1, 3), np.float32)
+    model = SpringMassModel(
+        object_node=node,
+        initial_velocity=np.float32([[1.0, 0.0, 0.0]]),
+        spring_nodes=np.zeros((0, 2), np.int32),
+        rest_length=np.zeros(0, np.float32),
+        stiffness=np.zeros(0, np.float32),
+        damping=np.zeros(0, np.float32),
+        object_spring_count=0,
+        control_count=0,
+    )
+    parameters = SimulationParameters(
+        drag=0.0,
+        restitution=0.0,
+        friction=0.4,
+        gravity=GRAVITY,
+        ground_height=0.0,
+        frame_rate=100.0,
+        substeps_per_frame=100,
+    )
+    control = np.zeros((12, 0, 3), np.float32)
+    simulator = Simulator(model, parameters, device)
+    firm = simulator.rollout(control).position
+    restart = Restart(
+        frame=5, position=firm[5], velocity=model.initial_velocity, friction_share=0.25
+    )
+    smoother = simulator.rollout(control, restart).position
+    again = simulator.rollout(control).position
+    np.testing.assert_array_equal(again, firm)
+    time = np.arange(7) / 100.0
+    for way, friction, start in ((firm, 0.4, 0), (smoother, 0.1, 5)):
+        expected = time - 0.5 * friction * GRAVITY * time**2
+        moved = way[start : start + 7, 0, 0] - way[start, 0, 0]
+        np.testing.assert_allclose(moved, expected, atol=1e-4)
+    np.testing.assert_array_equal(smoother[:6], firm[:6])
+    assert expected[-1] - (time[-1] - 0.5 * 0.4 * GRAVITY * time[-1] ** 2) > 4e-3
+
+
 def test_frames_in_which_grips_slip_agree_with_the_oracle(device: str) -> None:
     scene = cube_scene()
     rigid = another_state(scene, 0)

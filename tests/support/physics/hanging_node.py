@@ -46,19 +46,20 @@ def hanging_node(
     )
 
 
-def slipping_node(strength: float = 6.0) -> ObjectRollout:
-    """The same, simulated: from frame 2 on what holds the node slips, as long as that bears less.
+def slipping_node(strength: float = 6.0, share: float = 0.1) -> ObjectRollout:
+    """The same, simulated: from frame 2 on what holds the node slips, and the ground is smoother.
 
-    The spring pulls by up to 20 N.
+    The spring would pull by up to 20 N, and the other node would all but stop on the ground.
     """
     made = hanging_node()
-    node = made.model.object_node
+    free = Simulator(made.model, made.parameters).rollout(made.control)
     restart = Restart(
         frame=2,
-        position=node,
-        velocity=np.zeros_like(node),
+        position=free.position[2],
+        velocity=free.velocity[2],
         shifts_nodes=True,
         grip_strength=strength,
+        friction_share=share,
     )
     motion = Simulator(made.model, made.parameters).rollout(made.control, restart)
     state = {"position": motion.position, "velocity": motion.velocity}
