@@ -175,7 +175,10 @@ def _restart_rows(rollout: ObjectRollout, frame: int) -> "Rows":
     restart = rollout.restart
     if restart is None or frame <= restart.frame:
         return []
-    return [("predicted from", f"the observed state at frame {restart.frame}")]
+    rows = [("predicted from", f"the observed state at frame {restart.frame}")]
+    if restart.friction_share < 1.0:
+        rows.append(("friction", f"{100 * restart.friction_share:.2g} % of the fitted one is left"))
+    return rows
 
 
 def _attached_rows(model: SpringMassModel, spring: int) -> "Rows":

@@ -31,6 +31,7 @@ from physhandi.simulation.parameters import PARAMETERS
 Code = Literal[
     "at_bound",
     "unsteady",
+    "stuck",
     "worse_than_static",
     "worse_than_rigid_follow",
     "worse_than_last_residual",
@@ -122,7 +123,8 @@ def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> li
         message = skipped_object([sequence])
         skipped = [] if message is None else [FitWarning(code="object_skipped", message=message)]
         return [*skipped, *_unseen_hands(out, sequence), *_lone_views(out, sequence)]
-    doubts = [*_at_bounds(out), *_unsteady(out), *_worse_than_baselines(scores)]
+    doubts = [*_at_bounds(out), *_unsteady(out), *_stuck(out, sequence.name)]
+    doubts += _worse_than_baselines(scores)
     doubts += _doubts_of_shape(out)
     model = artefacts.load_model(out, sequence.name)
     doubts += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
@@ -176,6 +178,21 @@ def _unsteady(out: Path) -> Iterator[FitWarning]:
             "rounding decides which way it goes, so its prediction is partly luck. Try another "
             "seed of the search (object_.search.seed), a longer connection_radius, or more frames.",
         )
+
+
+def _stuck(out: Path, name: str) -> Iterator[FitWarning]:
+    """Tell if the fit holds still what was seen to slide."""
+    restart = artefacts.load_restart(out, name)
+    if restart is None or restart.friction_share == 1.0:
+        return
+    fitted = artefacts.load_parameters(out).friction
+    yield FitWarning(
+        code="stuck",
+        message="In the last fitted frames the object was seen to slide over the ground, where its "
+        f"friction of {fitted:.2g} holds it in the fit. The frames after them are predicted with "
+        f"{restart.friction_share * fitted:.2g}, with which it goes on as fast. Frames in which it "
+        "lies still tell only that friction is enough: fit more frames in which it slides.",
+    )
 
 
 def _worse_than_baselines(scores: Mapping[str, Any]) -> Iterator[FitWarning]:

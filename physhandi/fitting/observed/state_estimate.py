@@ -31,7 +31,7 @@ STUCK = 0.25
 """What lies is stuck if it would go on by less than this part of the way that was seen."""
 LEAST_FRICTION = 1.0 / 32.0
 """Least part of the friction that is left."""
-HALVINGS = 6
+FRICTION_HALVINGS = 6
 """How often the interval between the least part and all of it is halved, on a logarithmic scale."""
 
 
@@ -157,7 +157,7 @@ def _friction_share(
     if slides(LEAST_FRICTION) <= 1.0:
         return LEAST_FRICTION
     low, high = np.log(LEAST_FRICTION), 0.0
-    for _ in range(HALVINGS):
+    for _ in range(FRICTION_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if slides(float(np.exp(middle))) > 1.0 else (low, middle)
     return float(np.float32(np.exp(0.5 * (low + high))))

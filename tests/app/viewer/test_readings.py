@@ -81,6 +81,10 @@ def test_a_spring_after_a_restart_is_read_with_its_new_rest_length():
     # 2 · 10 · 0.0909; it gets 0.01 m shorter in the frame, 30 times a second.
     assert after["pull"] == "1.22 N"
     assert after["predicted from"] == "the observed state at frame 1"
+    assert "friction" not in after
+    smoother = replace(rollout, restart=replace(restart, friction_share=0.125))
+    for frame, told in ((1, None), (2, "12 % of the fitted one is left")):
+        assert dict(readings.rows(own, smoother, frame, frame)).get("friction") == told
     node = dict(readings.rows(Pick(kind="node", index=1), rollout, 2, 2))
     assert node["velocity"].startswith("0.3 m/s")
     assert node["predicted from"] == "the observed state at frame 1"

@@ -19,6 +19,7 @@ from physhandi.metrics.report import score_run
 from physhandi.run import warnings_in
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import Restart
 from physhandi.simulation.topology import build_model
 
 FRAMES, FITTED = 11, 8
@@ -214,6 +215,25 @@ def test_a_motion_that_hangs_on_rounding_is_told(
         assert "object_.search.seed" in message
 
 
+@pytest.mark.parametrize(("share", "said"), [(1.0, False), (0.25, True)])
+def test_an_object_that_was_seen_to_slide_and_is_stuck_is_told(
+    stored: Stored, sequence: Sequence, share: float, said: bool
+) -> None:
+    stored.array("rollout", GRID + RISE)
+    stored.parameters(PARAMETERS.replace(friction=0.6))
+    state = (GRID + RISE[FITTED - 1]).astype(np.float32)
+    restart = Restart(
+        frame=FITTED - 1, position=state, velocity=np.zeros_like(state), friction_share=share
+    )
+    save_file(restart.to_tensors(), stored.folder / "restart.safetensors")
+    messages = found(stored, sequence)
+    assert ("stuck" in messages) == said
+    if said:
+        (message,) = messages["stuck"]
+        assert "friction of 0.6 holds it" in message
+        assert "predicted with 0.15," in message
+
+
 @pytest.mark.parametrize("content", [{"nudge": 0.01}, {"nudge": 0.01, "limit": 0.05, "sway": "x"}])
 def test_a_damaged_file_of_steadiness_is_named(
     stored: Stored, sequence: Sequence, content: dict[str, Any]
@@ -297,8 +317,9 @@ def test_what_was_found_with_the_nodes_is_repeated(stored: Stored, sequence: Seq
 def test_a_prediction_from_an_observed_state_has_the_residual_of_that_state(
     stored: Stored, sequence: Sequence
 ) -> None:
-    state = {"position": (GRID + RISE[FITTED - 1]).astype(np.float32)}
-    save_file(state, stored.folder / "restart.safetensors")
+    state = (GRID + RISE[FITTED - 1]).astype(np.float32)
+    restart = Restart(frame=FITTED - 1, position=state, velocity=np.zeros_like(state))
+    save_file(restart.to_tensors(), stored.folder / "restart.safetensors")
     scores = score_run(stored.out, sequence)["future"]
     assert scores["last_residual"]["track_error"] == pytest.approx(
         scores["rollout"]["track_error"], rel=1e-3
