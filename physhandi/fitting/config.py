@@ -393,7 +393,7 @@ class PredictionConfig(Settings, frozen=True, kw_only=True):
     strain_time: Annotated[float, Meta(ge=0.0, le=1e3)] = 1.0
     """Time until the last fitted frame over which the strain that springs keep is averaged, except
     of what lies on the ground; 0 keeps that of the frame alone [s]."""
-    grip_strength: Annotated[float, Meta(ge=0.0, le=1e9)] = 30.0
+    grip_strength: Annotated[float, Meta(ge=0.0, le=1e6)] = 30.0
     """How many times its weight the object may be pulled by all virtual springs that act in the
     last fitted frame, shared by them evenly. One that is pulled harder slips; 0 if none does."""
     keeps_sliding: bool = True

@@ -236,6 +236,9 @@ class Restart:
             frame: The frame, after the restart.
             position: Where springs have the object nodes at its end [m].
             control: Where virtual springs end then [m].
+
+        Returns:
+            Rest lengths [m]; the given array itself if nothing slips.
         """
         virtual = slice(model.object_spring_count, None)
         ends = model.spring_nodes[virtual]
@@ -247,6 +250,8 @@ class Restart:
         stiffness = parameters.stiffness_scale * model.stiffness[virtual].astype(np.float64)
         strain = length / rest - 1.0
         slips = model.acts_in(frame)[virtual] & (stiffness * np.abs(strain) > self.grip_strength)
+        if not slips.any():
+            return rest_length
         borne = np.copysign(self.grip_strength / stiffness[slips], strain[slips])
         rest[slips] = np.maximum(
             length[slips] / (1.0 + borne),

@@ -211,10 +211,10 @@ class Simulator:
         """
         if restart.grip_strength == 0.0:
             return
-        springs, now = self.rest_length.numpy(), self.position.numpy()
-        self.rest_length.assign(
-            restart.slipped(self.model, self.parameters, springs, frame, now, control)
-        )
+        before, now = self.rest_length.numpy(), self.position.numpy()
+        after = restart.slipped(self.model, self.parameters, before, frame, now, control)
+        if after is not before:
+            self.rest_length.assign(after)
 
     def step_frame(
         self,

@@ -1,6 +1,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,28 +122,28 @@ def test_every_simulation_of_the_sequence_restarts_with_the_strain_it_had(
     assert np.abs(plain.tensions(AT + 1) - rollout.tensions(AT + 1)).max() > 1e-3
 
 
+def restarting_otherwise(source: Run, folder: Path, **changes: Any) -> Run:
+    """Copy a run and change its restart."""
+    shutil.copytree(source.folder, folder)
+    run = Run.open(folder)
+    path = run.out / SequenceFiles("lift").restart
+    state = Restart.from_tensors(load_file(path))
+    save_file(replace(state, **changes).to_tensors(), path)
+    return run
+
+
 @pytest.fixture(scope="module")
 def shifted(restarted, tmp_path_factory) -> Run:
     """The same, where springs go on beside where nodes are seen."""
     folder = tmp_path_factory.mktemp("shifted") / "sheet"
-    shutil.copytree(restarted.folder, folder)
-    run = Run.open(folder)
-    path = run.out / SequenceFiles("lift").restart
-    state = Restart.from_tensors(load_file(path))
-    save_file(replace(state, shifts_nodes=True, strain_frames=3).to_tensors(), path)
-    return run
+    return restarting_otherwise(restarted, folder, shifts_nodes=True, strain_frames=3)
 
 
 @pytest.fixture(scope="module")
 def slipping(shifted, tmp_path_factory) -> Run:
     """The same, where most grips slip."""
     folder = tmp_path_factory.mktemp("slipping") / "sheet"
-    shutil.copytree(shifted.folder, folder)
-    run = Run.open(folder)
-    path = run.out / SequenceFiles("lift").restart
-    state = Restart.from_tensors(load_file(path))
-    save_file(replace(state, grip_strength=STRENGTH).to_tensors(), path)
-    return run
+    return restarting_otherwise(shifted, folder, grip_strength=STRENGTH)
 
 
 def test_springs_of_every_frame_are_those_that_are_left_when_grips_have_slipped(
