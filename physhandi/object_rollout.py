@@ -143,9 +143,9 @@ class ObjectRollout:
     def parameters_in(self, frame: int) -> SimulationParameters:
         """Get the parameters on the way to a frame: a restart may leave less friction."""
         restart = self.restart
-        if restart is None or frame <= restart.frame or restart.friction_share == 1.0:
+        if restart is None or frame <= restart.frame:
             return self.parameters
-        return self.parameters.replace(friction=restart.friction_share * self.parameters.friction)
+        return restart.parameters_after(self.parameters)
 
     def going_on(self, frame: int) -> tuple[SpringMassModel, NodeState]:
         """Get what is needed to go on from a frame in another way.
@@ -360,8 +360,6 @@ class ObjectRollout:
                 weight = (0.5 if stop in {0, count} else 1.0) / count
                 mean = mean + weight * np.asarray(measure(frame, *state), np.float64)
                 before = place
-            if self.restart is not None and frame > self.restart.frame:
-                simulator.let_grips_slip(self.restart, frame, before)
             means.append(mean)
         return np.stack(means)
 

@@ -16,6 +16,23 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
 
+def spring_lengths(
+    model: SpringMassModel,
+    position: Float[ndarray, "node 3"],
+    control: Float[ndarray, "control 3"],
+    springs: slice = slice(None),
+) -> Float[ndarray, " chosen"]:
+    """Measure how long springs are [m].
+
+    Args:
+        model: Springs.
+        position: Positions of the object nodes [m].
+        control: Positions of the control nodes [m].
+        springs: Which of them; object springs come first, then virtual ones.
+    """
+    return np.linalg.norm(_offsets(model.spring_nodes[springs], position, control), axis=1)
+
+
 def spring_strains(
     model: SpringMassModel,
     position: Float[ndarray, "node 3"],
@@ -31,8 +48,7 @@ def spring_strains(
     Returns:
         Strains, object springs and then virtual ones in the model's order.
     """
-    offset = _offsets(model.spring_nodes, position, control)
-    return np.linalg.norm(offset, axis=1) / model.rest_length - 1.0
+    return spring_lengths(model, position, control) / model.rest_length - 1.0
 
 
 def spring_tensions(  # noqa: PLR0917  (model, then state in the order of the equations)

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
-from physhandi.simulation.forces import spring_strains
+from physhandi.simulation.forces import spring_lengths, spring_strains
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.stability import SAFETY
@@ -213,6 +213,12 @@ class Restart:
         total = sum(share * spring_strains(model, *place) for share, *place in each)
         return total / acts.sum(axis=0)
 
+    def parameters_after(self, parameters: SimulationParameters) -> SimulationParameters:
+        """Give the parameters of the frames after the restart, with the friction that is left."""
+        if self.friction_share == 1.0:
+            return parameters
+        return parameters.replace(friction=self.friction_share * parameters.friction)
+
     def slipped(  # noqa: PLR0917  (the springs, then the state at a frame's end)
         self,
         model: SpringMassModel,
@@ -241,11 +247,9 @@ class Restart:
             Rest lengths [m]; the given array itself if nothing slips.
         """
         virtual = slice(model.object_spring_count, None)
-        ends = model.spring_nodes[virtual]
-        if self.grip_strength == 0.0 or len(ends) == 0:
+        if self.grip_strength == 0.0 or model.virtual_spring_count == 0:
             return rest_length
-        place = np.concatenate([position, control]).astype(np.float64)
-        length = np.linalg.norm(place[ends[:, 1]] - place[ends[:, 0]], axis=1)
+        length = spring_lengths(model, position, control, virtual)
         rest = rest_length[virtual].astype(np.float64)
         stiffness = parameters.stiffness_scale * model.stiffness[virtual].astype(np.float64)
         strain = length / rest - 1.0

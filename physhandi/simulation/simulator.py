@@ -78,8 +78,8 @@ class Simulator:
         self.control_end = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
         self.first_divergence = self.array(np.array([NO_DIVERGENCE]), wp.int32)
         self._held: ndarray | None = None
-        self._is_smoother = False
-        """Whether a restart left less friction than the parameters say."""
+        self._restart: Restart | None = None
+        """What the simulation went on from, whose rules hold until it is reset."""
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
         self._candidates = 0
         self._collision: SelfCollision | None = None
@@ -109,8 +109,9 @@ class Simulator:
                 "frame_rate and substeps_per_frame are fixed in a simulator; build a new one."
             )
         self.parameters = parameters
-        self.world.assign(world_array([parameters]))
-        self._is_smoother = False
+        restart = self._restart
+        now = parameters if restart is None else restart.parameters_after(parameters)
+        self.world.assign(world_array([now]))
 
     def override_world(self, **values: float) -> None:
         """Set fields of the kernels' `World` directly, bounds unchecked, until the next change."""
@@ -159,8 +160,7 @@ class Simulator:
         self.rest_length.assign(self.model.rest_length)
         self.clearance.assign(self.model.clearance)
         self.first_divergence.fill_(NO_DIVERGENCE)
-        if self._is_smoother:
-            self.set_parameters(self.parameters)
+        self._follow(None)
         if self.hand_contact is not None:
             self.hand_contact.shift(None)
         if self.rod is not None:
@@ -192,24 +192,26 @@ class Simulator:
         self.reset(restart.start_of_springs(position[-1]), restart.velocity)
         self.rest_length.assign(model.rest_length)
         self.clearance.assign(model.clearance)
-        if restart.friction_share != 1.0:
-            self.override_world(friction=restart.friction_share * self.parameters.friction)
-            self._is_smoother = True
+        self._follow(restart)
         if self.hand_contact is not None:
             self.hand_contact.shift(hand_shift)
         return hand_shift, restart.node_shift(position[-1])
 
-    def let_grips_slip(
-        self, restart: Restart, frame: int, control: Float[ndarray, "control 3"]
-    ) -> None:
-        """Change rest lengths for what follows a frame as a restart before it lets grips slip.
+    def _follow(self, restart: Restart | None) -> None:
+        """Have the rules of a restart hold from now on, or none."""
+        before, self._restart = self._restart, restart
+        if any(each is not None and each.friction_share != 1.0 for each in (before, restart)):
+            self.set_parameters(self.parameters)
+
+    def _let_grips_slip(self, frame: int, control: Float[ndarray, "control 3"]) -> None:
+        """Change rest lengths as a restart lets grips slip at the end of a frame after its own.
 
         Args:
-            restart: The state from which the simulation went on.
-            frame: The frame that has been reached, a later one than the restart's.
+            frame: The frame that has been reached.
             control: Where virtual springs end now [m].
         """
-        if restart.grip_strength == 0.0:
+        restart = self._restart
+        if restart is None or restart.grip_strength == 0.0 or frame <= restart.frame:
             return
         before, now = self.rest_length.numpy(), self.position.numpy()
         after = restart.slipped(self.model, self.parameters, before, frame, now, control)
@@ -239,6 +241,8 @@ class Simulator:
         if self.model.control_count:
             self.control_start.assign(np.ascontiguousarray(control_start, dtype=np.float32))
             self.control_end.assign(np.ascontiguousarray(control_end, dtype=np.float32))
+        if not goes_on:
+            self._let_grips_slip(frame - 1, control_start)
         self.hold(frame)
         self.replay_frame(goes_on=goes_on)
         self.check_divergence(frame)
@@ -286,10 +290,7 @@ class Simulator:
         for frame in range(len(control)):
             if frame > 0:
                 way = control[frame - 1 : frame + 1]
-                way = way if hand_shift is None else way + hand_shift
-                self.step_frame(frame, *way)
-                if restart is not None and frame > restart.frame:
-                    self.let_grips_slip(restart, frame, way[1])
+                self.step_frame(frame, *(way if hand_shift is None else way + hand_shift))
             position = self.position.numpy().copy()
             if frame in strained:
                 own.append(position)

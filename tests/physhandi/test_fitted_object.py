@@ -147,7 +147,7 @@ def slipping(shifted, tmp_path_factory) -> Run:
 
 
 def test_springs_of_every_frame_are_those_that_are_left_when_grips_have_slipped(
-    shifted, slipping, tmp_path: Path
+    shifted, slipping
 ) -> None:
     firm, rollout = (FittedObject.of(each, "lift").simulate() for each in (shifted, slipping))
     assert rollout.restart is not None

@@ -185,13 +185,14 @@ def _stuck(out: Path, name: str) -> Iterator[FitWarning]:
     restart = artefacts.load_restart(out, name)
     if restart is None or restart.friction_share == 1.0:
         return
-    fitted = artefacts.load_parameters(out).friction
+    fitted = artefacts.load_parameters(out)
+    left = restart.parameters_after(fitted).friction
     yield FitWarning(
         code="stuck",
         message="In the last fitted frames the object was seen to slide over the ground, where its "
-        f"friction of {fitted:.2g} holds it in the fit. The frames after them are predicted with "
-        f"{restart.friction_share * fitted:.2g}, with which it goes on as fast. Frames in which it "
-        "lies still tell only that friction is enough: fit more frames in which it slides.",
+        f"friction of {fitted.friction:.2g} holds it in the fit. The frames after them are "
+        f"predicted with {left:.2g}, with which it goes on as fast. Frames in which it lies still "
+        "tell only that friction is enough: fit more frames in which it slides.",
     )
 
 

@@ -146,7 +146,6 @@ def _friction_share(
         try:
             for number, (start, end) in enumerate(pairwise(ahead), frame + 1):
                 simulator.step_frame(number, start, end)
-                simulator.let_grips_slip(less, number, end)
         except SimulationDivergedError:
             return np.inf
         way = (simulator.position.numpy() - position[frame])[lies].mean(axis=0)[:2]

@@ -222,6 +222,20 @@ def test_strain_of_what_lies_on_the_ground_is_that_of_the_moment() -> None:
         np.testing.assert_allclose(spring_strains(later, row, hands[1]), mean, rtol=1e-6)
 
 
+def loose_nodes(node: np.ndarray) -> SpringMassModel:
+    """Nodes at rest that nothing joins or holds."""
+    return SpringMassModel(
+        object_node=node,
+        initial_velocity=np.zeros_like(node),
+        spring_nodes=np.zeros((0, 2), np.int32),
+        rest_length=np.zeros(0, np.float32),
+        stiffness=np.zeros(0, np.float32),
+        damping=np.zeros(0, np.float32),
+        object_spring_count=0,
+        control_count=0,
+    )
+
+
 def hanging() -> tuple[SpringMassModel, SimulationParameters, np.ndarray]:
     """1 kg that hangs at rest below a control node, and controls for six frames."""
     model = SpringMassModel(
@@ -306,16 +320,7 @@ def test_a_grip_slips_and_bears_what_it_is_strong_enough_for(device: str, side: 
 
 def test_after_a_restart_a_part_of_the_friction_is_left_and_before_it_all(device: str) -> None:
     node = np.zeros((1, 3), np.float32)
-    model = SpringMassModel(
-        object_node=node,
-        initial_velocity=np.float32([[1.0, 0.0, 0.0]]),
-        spring_nodes=np.zeros((0, 2), np.int32),
-        rest_length=np.zeros(0, np.float32),
-        stiffness=np.zeros(0, np.float32),
-        damping=np.zeros(0, np.float32),
-        object_spring_count=0,
-        control_count=0,
-    )
+    model = replace(loose_nodes(node), initial_velocity=np.float32([[1.0, 0.0, 0.0]]))
     parameters = SimulationParameters(
         drag=0.0,
         restitution=0.0,
@@ -435,17 +440,7 @@ def test_rest_lengths_stay_above_their_bounds_and_coincident_nodes_keep_theirs()
 
 def test_what_lies_on_the_ground_lies_where_it_is_seen_and_what_does_not_falls(device: str) -> None:
     node = np.array([[0, 0, 0.004], [0.1, 0, 0.0065], [0.2, 0, 0.02]], np.float32)
-    model = SpringMassModel(
-        object_node=node,
-        initial_velocity=np.zeros_like(node),
-        spring_nodes=np.zeros((0, 2), np.int32),
-        rest_length=np.zeros(0, np.float32),
-        stiffness=np.zeros(0, np.float32),
-        damping=np.zeros(0, np.float32),
-        object_spring_count=0,
-        control_count=0,
-        clearance=np.float32([0.004, 0.004, 0.004]),
-    )
+    model = replace(loose_nodes(node), clearance=np.float32([0.004, 0.004, 0.004]))
     parameters = SimulationParameters(restitution=0.0, frame_rate=30.0, ground_height=0.0)
     seen = node + np.float32([0.0, 0.0, 0.005])
     restart = Restart(frame=0, position=seen, velocity=np.zeros_like(node))
