@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 import yaml
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 from safetensors.numpy import load_file
 from support.browser.scene_page import ScenePage, object_springs
 
@@ -253,6 +253,23 @@ def test_a_run_page_exports_the_rollout(home, fitted, tmp_path, picture):
     expect(home.locator("#metrics-heading")).to_be_visible()
     # Tables of scores that are wider than a phone scroll by themselves.
     assert home.evaluate("document.documentElement.scrollWidth") == 390
+
+
+def test_what_is_clicked_stays_in_place_when_the_server_says_what_will_run(home):
+    dialog = home.locator("dialog#new")
+    profile = dialog.get_by_label("paper")
+    before = []
+
+    def measure(route: Route) -> None:
+        expect(dialog.locator("[data-readiness]")).to_be_hidden()
+        before.append(profile.bounding_box())
+        route.continue_()
+
+    home.route("**/api/v1/runs/check", measure)
+    home.locator("[data-sequence=towel_fold] [data-new]").click()
+
+    expect(dialog.locator("[data-readiness]")).to_be_visible()
+    assert [profile.bounding_box()] == before
 
 
 def test_a_fit_is_launched_followed_and_cancelled(home, served):
