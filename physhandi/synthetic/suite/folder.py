@@ -134,8 +134,9 @@ class SuiteFolder:
         against = "phystwin" if "phystwin" in methods else (methods or [""])[0]
         differences = compare(scores, against)
         above = compare(scores, FLOOR) if against != FLOOR else []
-        pictures = write_motion_pictures(self.out / "charts", recordings, cells, device)
-        about["pictures"] = list(pictures)
+        about["pictures"] = list(
+            write_motion_pictures(self.out / "charts", recordings, cells, about["seed_of"], device)
+        )
         files = write_report(about, rows, differences, above, cells)
         about["charts"] = [Path(file).name for file in files if file.startswith("charts/")]
         about["charts"] += about["pictures"]

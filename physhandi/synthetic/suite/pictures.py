@@ -104,6 +104,7 @@ def write_motion_pictures(
     folder: Path,
     recordings: Many[Sequence],
     cells: Many[Mapping[str, object]],
+    seed_of: Mapping[str, str],
     device: str = "cpu",
 ) -> Iterator[str]:
     """Write a picture of every sequence of a suite, and give the name of each file.
@@ -112,17 +113,21 @@ def write_motion_pictures(
         folder: Where pictures go.
         recordings: The whole recordings; those without a true surface or a view are left out.
         cells: The suite's finished cells.
+        seed_of: The method of which others are one seed; its first seed is drawn.
         device: Warp device that draws them.
     """
     for recording in recordings:
-        runs = {
-            str(cell["method"]): RunFolder.open(folder.parent / "cells" / str(cell["run"]))
-            for cell in cells
-            if (cell["protocol"], cell["case"]) == ("main", recording.name)
-            and cell["run"]
-            and not cell["error"]
-            and _is_drawn(str(cell["method"]))
-        }
+        runs: dict[str, RunFolder] = {}
+        for cell in cells:
+            method = seed_of.get(str(cell["method"]), str(cell["method"]))
+            if (
+                (cell["protocol"], cell["case"]) == ("main", recording.name)
+                and cell["run"]
+                and not cell["error"]
+                and _is_drawn(method)
+                and method not in runs
+            ):
+                runs[method] = RunFolder.open(folder.parent / "cells" / str(cell["run"]))
         try:
             picture = motion_picture(recording, runs, device)
         except MissingInputError:

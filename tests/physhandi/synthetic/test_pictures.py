@@ -122,10 +122,18 @@ def test_a_suite_gets_a_picture_of_every_sequence_that_tells_its_surface(
         common | {"method": "quick@refinement.iterations=0", "run": "b"},
         common | {"method": "phystwin", "run": "", "error": "It diverged."},
     ]
-    (name,) = write_motion_pictures(tmp_path / "charts", [recording], cells)
+    (name,) = write_motion_pictures(tmp_path / "charts", [recording], cells, {})
     image = cv2.imread(str(tmp_path / "charts" / name))
     # The truth and one method: rules, variants and failures are left out.
     assert image.shape[0] == 2 * LABEL + 2 * HEIGHT
-    assert list(write_motion_pictures(tmp_path / "more", [plain], cells)) == []
+    assert list(write_motion_pictures(tmp_path / "more", [plain], cells, {})) == []
+
+    seeds = {"quick@object_.search.seed=7": "quick", "quick@object_.search.seed=1": "quick"}
+    searched = [
+        common | {"method": method, "run": run} for method, run in zip(seeds, "ab", strict=True)
+    ]
+    (tmp_path / "charts" / name).unlink()
+    list(write_motion_pictures(tmp_path / "charts", [recording], searched, seeds))
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "charts" / name)), image)
     with pytest.raises(MissingInputError, match="'low' tells no true surface"):
         motion_picture(plain, {})
