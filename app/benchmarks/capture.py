@@ -26,6 +26,7 @@ from physhandi.data.environment import processor_name
 from physhandi.data.files import write_json, write_yaml
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
+from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.truth import read_truth
 from physhandi.data.view import View
 from physhandi.errors import CancelledError, PhysHandiError, RunError, UsageError, describe
@@ -45,7 +46,8 @@ CAPTURE_GOALS: Mapping[str, float] = {
 _AT_LEAST = ("object_iou", "hand_iou", "tracks_alive", "tracks_alive_in_each_view")
 _MODULE = "app.benchmarks.capture"
 _RESULT = "capture.json"
-_INPUTS = ("import", "exact")
+_SAME_HANDS = "exact_same_hands"
+_INPUTS = ("import", "exact", _SAME_HANDS)
 _METRICS = ("chamfer_l1", "track_error")
 _SPLITS = {"fitted": "reconstruction", "predicted": "future"}
 _TELL_EVERY_S = 0.5
@@ -87,9 +89,11 @@ def benchmark_capture(
     mean over frames and views of intersection over union. Tracks are lifted by measured depth where
     a fit would lift them, and compared with where the true surface point that they began on is in
     every later frame; those of the recording are measured beside them. Cameras: the worst of all
-    pairs, as the one sees the other. Fits are of the import and of the recording with exact masks
-    and tracks and its own depth and keypoints; both are scored against the cloud of the latter and
-    the recording's true paths, in its world, to which the import is moved along the table.
+    pairs, as the one sees the other. Fits are of the import, of the recording with exact masks and
+    tracks and its own depth and keypoints, and of the latter with the import's keypoints
+    (``exact_same_hands``), which tells what masks and tracks cost apart from what hands cost. All
+    are scored against the cloud of exact masks and the recording's true paths, in its world, to
+    which the import is moved along the table.
 
     Args:
         scenes: Objects and actions, like ``cloth/lift``; none takes all of `dev_rgbd`.
@@ -174,6 +178,7 @@ class ScenePlace:
         self.raw = folder / "raw"
         self.imported = folder / "import" / self.name
         self.variants = folder / "variants"
+        self.same_hands = folder / "same_hands" / self.name
         self._runs = folder / "runs"
 
     def run(self, given: str, search_seed: int) -> Path:
@@ -255,7 +260,7 @@ def _measured(scene: str, folder: Path, order: CaptureOrder, steps: _Steps) -> d
 def _fitted(
     do: Callable[..., dict[str, Any]], order: CaptureOrder, seconds: dict[str, float]
 ) -> dict[str, Any]:
-    """Fit both inputs from every seed, then score them; a fit that failed is told as such."""
+    """Fit every input from every seed, then score them; a fit that failed is told as such."""
     failed: dict[tuple[str, int], str] = {}
     every = [(given, seed) for given in _INPUTS for seed in order.search_seeds]
     for given, seed in every:
@@ -279,15 +284,22 @@ def _fitted(
             except RunError as error:
                 about["error"] = str(error)
         fits[given].append(about)
-    return {"fits": fits, "ratio": ratios(fits)}
+    return {
+        "fits": fits,
+        "ratio": ratios(fits, "exact"),
+        "ratio_same_hands": ratios(fits, _SAME_HANDS),
+    }
 
 
-def ratios(fits: Mapping[str, Many[Mapping[str, Any]]]) -> dict[str, dict[str, float | None]]:
-    """Divide the mean error of the import's fits by that of the fits from exact masks and tracks.
+def ratios(
+    fits: Mapping[str, Many[Mapping[str, Any]]], reference: str
+) -> dict[str, dict[str, float | None]]:
+    """Divide the mean error of the import's fits by that of the fits of another input.
 
     Args:
         fits: Scores of each input's fits, in `fitted` and `predicted` frames; those with an `error`
             have none.
+        reference: The other input.
 
     Returns:
         For both kinds of frames each metric's ratio; None if an input has no scored fit.
@@ -298,7 +310,8 @@ def ratios(fits: Mapping[str, Many[Mapping[str, Any]]]) -> dict[str, dict[str, f
         for metric in _METRICS:
             name = f"{metric}_mm"
             values = [
-                [one[split][name] for one in fits[given] if "error" not in one] for given in _INPUTS
+                [one[split][name] for one in fits[given] if "error" not in one]
+                for given in ("import", reference)
             ]
             is_known = all(of_input and None not in of_input for of_input in values)
             by_split[split][metric] = fmean(values[0]) / fmean(values[1]) if is_known else None
@@ -496,7 +509,7 @@ def _track_figures(sequence: Sequence, surface: Any) -> dict[str, Any]:
 def fit_scene(
     place: ScenePlace, given: str, search_seed: int, order: CaptureOrder, progress: Progress
 ) -> dict[str, Any]:
-    """Fit the import, or the recording with exact masks and tracks."""
+    """Fit the import, or the recording with exact masks and tracks and anyone's keypoints."""
     from physhandi.api import reconstruct
     from physhandi.synthetic.suite.methods import SEARCH_SEED
     from physhandi.synthetic.suite.variants import make_variant
@@ -506,6 +519,8 @@ def fit_scene(
     else:
         recording = Sequence.load(place.recording)
         sequence = make_variant(recording, "exact_annotation", place.variants)
+    if given == _SAME_HANDS:
+        sequence = _with_keypoints(sequence, Sequence.load(place.imported), place.same_hands)
     reconstruct(
         sequence,
         profile=order.fit,
@@ -515,6 +530,20 @@ def fit_scene(
         device=order.device,
     )
     return {}
+
+
+def _with_keypoints(sequence: Sequence, other: Sequence, folder: Path) -> Sequence:
+    """Write a sequence once more, with the hand keypoints of another of the same pictures."""
+    if folder.is_dir():
+        return Sequence.load(folder)
+    with SequenceWriter(folder) as writer:
+        for path in sorted(sequence.folder.rglob("*")):
+            if path.is_file() and path.name not in (FILE, "keypoint.npy"):
+                writer.copy(path.relative_to(sequence.folder).as_posix(), path)
+        for view in other.views:
+            if view.keypoint is not None:
+                writer.save_array(f"views/{view.name}/keypoint.npy", view.keypoint)
+        return writer.finish(sequence.meta)
 
 
 def score_fit(

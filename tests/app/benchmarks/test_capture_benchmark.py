@@ -5,6 +5,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.physics.synthetic_world import lifted_sheet
 from support.waiting import LIMIT_S
@@ -12,6 +13,7 @@ from support.waiting import LIMIT_S
 from app import cli
 from app.benchmarks import capture
 from app.benchmarks.capture import CaptureOrder, ScenePlace
+from physhandi import api
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import RunError
@@ -56,6 +58,23 @@ def test_a_made_scene_is_captured_imported_and_scored(
     assert found["tracks"]["median_mm"] < 5.0
     assert len(found["tracks"]["least_by_view"]) == 2
     assert set(capture.reached(found)) == set(capture.CAPTURE_GOALS) - {"chamfer_ratio"}
+    fitted: list[tuple[Sequence, Path]] = []
+
+    def fit(sequence: Sequence, *, out: Path, **_how: object) -> None:
+        fitted.append((sequence, out))
+
+    monkeypatch.setattr(api, "reconstruct", fit)
+    for given in ("import", "exact", "exact_same_hands", "exact_same_hands"):
+        capture.fit_scene(place, given, 7, order, NullProgress())
+    imported, exact, same_hands, again = [sequence for sequence, _ in fitted]
+    assert len({out for _, out in fitted}) == 3
+    assert again.folder == same_hands.folder
+    assert same_hands.fingerprint() != exact.fingerprint()
+    for own, shown, true in zip(same_hands.views, imported.views, exact.views, strict=True):
+        np.testing.assert_array_equal(own.keypoint, shown.keypoint)
+        assert not np.array_equal(own.keypoint, true.keypoint, equal_nan=True)
+        np.testing.assert_array_equal(own.track, true.track)
+        np.testing.assert_array_equal(own.mask(1), true.mask(1))
     for name in ("track.npy", "track_visible.npy"):
         (place.imported / "views/camera1" / name).unlink()
     surface = true_surface(read_truth(place.recording))
@@ -66,10 +85,13 @@ def test_a_made_scene_is_captured_imported_and_scored(
 
 def test_the_ratio_is_that_of_mean_errors_and_unknown_if_a_fit_is_not_scored() -> None:
     fits = {"import": [scored(9.0), scored(11.0)], "exact": [scored(8.0), {"error": "diverged"}]}
-    assert capture.ratios(fits)["fitted"] == {"chamfer_l1": 1.25, "track_error": 1.25}
+    fits["exact_same_hands"] = [scored(10.0)]
+    assert capture.ratios(fits, "exact")["fitted"] == {"chamfer_l1": 1.25, "track_error": 1.25}
+    assert capture.ratios(fits, "exact_same_hands")["fitted"]["track_error"] == 1.0
     fits["exact"] = [scored(None)]
-    assert capture.ratios(fits)["predicted"]["chamfer_l1"] is None
-    assert capture.ratios({"import": [], "exact": []})["fitted"]["chamfer_l1"] is None
+    assert capture.ratios(fits, "exact")["predicted"]["chamfer_l1"] is None
+    nothing = {"import": [], "exact": []}
+    assert capture.ratios(nothing, "exact")["fitted"]["chamfer_l1"] is None
 
 
 def test_a_fit_that_fails_is_told_beside_the_others(
@@ -88,14 +110,16 @@ def test_a_fit_that_fails_is_told_beside_the_others(
             asked.append((step, given, str(seed), str(about.get("reference_seed", ""))))
             if (step, given, seed) == ("fit", "exact", 5):
                 raise RunError("fit exact 5: all candidates diverged.")
-            of_step = {"score": figures, "score_fit": scored(9.0 if given == "import" else 6.0)}
+            error = {"import": 9.0, "exact": 6.0, "exact_same_hands": 8.0}.get(given)
+            of_step = {"score": figures, "score_fit": scored(error)}
             return {**of_step.get(step, {}), "step_seconds": 1.0}
 
     order = CaptureOrder(search_seeds=(5, 7))
     found = capture._measured("cloth/lift", tmp_path, order, Steps(1))
     assert found["fits"]["exact"][0]["error"] == "fit exact 5: all candidates diverged."
     assert found["ratio"]["fitted"]["chamfer_l1"] == 1.5
-    # Both are scored against the cloud of the first fit from exact masks that there is.
+    assert found["ratio_same_hands"]["fitted"]["chamfer_l1"] == 1.125
+    # All are scored against the cloud of the first fit from exact masks that there is.
     assert {seed for step, *_, seed in asked if step == "score_fit"} == {"7"}
     assert [name for name, is_reached in found["reached"].items() if not is_reached] == [
         *("hand_iou", "tracks_alive_in_each_view", "camera_turn_deg", "chamfer_ratio")
