@@ -4,8 +4,8 @@ A place of the object that is held stays where it is, seen from the hand; past a
 leaves, hovers or slides it moves. So each node near a hand is followed in the frame of the hand's
 surface beside it: as long as it stays within a tolerance, the two are in contact.
 
-Where no contact is found so, but what is near a hand stays in the air, the hand holds it all the
-same.
+Where no contact is found so, but what is near a hand stays in the air or is moved over the ground
+with the hand, the hand holds it all the same.
 
 Of frames after those that are fitted, only the hands are read: what holds in the last fitted frame
 goes on holding, until the hand opens.
@@ -62,9 +62,9 @@ OPENING = 0.75
 EVIDENCE, FARTHER = 3.0, 2.0
 """Longest way from a node to the nearest track that tells its motion, in distances of nodes, or in
 what it is at frame 0 if that is more. Where all are farther away, what holds a node is not told."""
-FOLLOWS, OF_FALL = 2.0, 0.5
-"""How far one may move, seen from the hand, that would fall if the hand did not hold it: so many
-times as far as a node in contact, and at most this part of its fall."""
+FOLLOWS, OF_WAY = 2.0, 0.5
+"""How far one may move, seen from the hand, that would be elsewhere if the hand did not hold it: so
+many times as far as a node in contact, and at most this part of the way that it would be off."""
 MOST_PAIRS = 80
 """Most pairs of a control node at a time."""
 
@@ -156,7 +156,10 @@ def find_contacts(
         height = np.broadcast_to(height.min(axis=1, keepdims=True), height.shape)
     for begin, end in _runs_without(held, last):
         fall = np.minimum(0.5 * gravity * ((end - begin) / frame_rate) ** 2, height[end])
-        index = _follower(hands, shown, (begin, end), fall, LONGEST_HOLD * reach, spacing)
+        way = np.linalg.norm(shown[begin : end + 1] - shown[begin], axis=2).max(axis=0)
+        stays = (height[begin] < spacing) & (gravity > 0.0)  # By friction.
+        off = np.where(stays, np.maximum(fall, way), fall)
+        index = _follower(hands, shown, (begin, end), off, LONGEST_HOLD * reach, spacing)
         if index is not None:
             held.append((index, begin, end))
     holding = np.unique([nearest[last, index] for index, _, end in held if end == last]).astype(int)
@@ -347,31 +350,31 @@ def _follower(  # noqa: PLR0917  (who moves, and what bounds it)
     hands: _Hands,
     seen: Float[ndarray, "frame node 3"],
     stretch: tuple[int, int],
-    fall: Float[ndarray, " node"],
+    off: Float[ndarray, " node"],
     farthest: float,
     spacing: float,
 ) -> int | None:
-    """Find the node that goes with a hand where it would fall if the hand did not hold it.
+    """Find the node that goes with a hand and would be elsewhere if the hand did not hold it.
 
     Args:
         hands: The hands.
         seen: Places of the nodes [m].
         stretch: First and last frame of a time in which nothing is held.
-        fall: How far each node would fall in that time [m].
+        off: How far each node would be from where it was seen then [m].
         farthest: Longest distance from the hand at first [m].
         spacing: Distance of nodes [m].
 
     Returns:
-        The nearest of these; None if all lie on the ground or leave the hand.
+        The nearest of these; None if all would stay or leave the hand.
     """
     begin, end = stretch
     distance, nearest = KDTree(hands.control[begin]).query(seen[begin])
     way = SLIP * spacing + GIVE * distance
-    candidate = np.flatnonzero((distance < farthest) & (fall > way))
+    candidate = np.flatnonzero((distance < farthest) & (off > way))
     for index in candidate[np.argsort(distance[candidate], kind="stable")]:
         local = hands.seen_from(seen[:, index], nearest[index : index + 1])[0, begin : end + 1]
         moved = np.linalg.norm(local - local[0], axis=1).max()
-        if moved < min(FOLLOWS * way[index], OF_FALL * fall[index]):
+        if moved < min(FOLLOWS * way[index], OF_WAY * off[index]):
             return int(index)
     return None
 

@@ -48,8 +48,9 @@ class ObjectSize:
     grip: float
     """The same of the control nodes at frame 0; at least the node spacing, and at most three."""
     gap: float
-    """Distance between the object and the nearest control node: at frame 0, or when contacts begin
-    if they are followed over time (0 if there are none)."""
+    """Distance between the object and the nearest control node: at frame 0, or, if contacts are
+    followed over time, the median over frames of what it was when those that hold then began (0 if
+    there are none)."""
 
 
 def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
@@ -76,8 +77,14 @@ def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
 def _gap(problem: ObjectProblem) -> float:
     if problem.contacts is None:
         return float(KDTree(problem.object_node).query(problem.control[0])[0].min())
-    distance = problem.contacts.distance
-    return float(distance.min()) if len(distance) else 0.0
+    first, last = problem.contacts.interval.T
+    frame = np.arange(problem.frame_count)[:, None]
+    nearest = np.where(
+        (first <= frame) & (frame <= last), problem.contacts.distance, np.float32(np.inf)
+    ).min(axis=1, initial=np.inf)
+    # Most of the time, since what touches for a moment and slides off holds nothing.
+    holding = nearest[np.isfinite(nearest)]
+    return float(np.median(holding)) if len(holding) else 0.0
 
 
 def neighbor_distance(node: Float[ndarray, "node 3"]) -> float:

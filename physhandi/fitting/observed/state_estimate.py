@@ -27,8 +27,9 @@ FEWEST_LYING = 0.1
 SLIDING = 0.0125
 """Least speed at which what lies is taken to slide [m/s]; tracks of toys that stand still, whose
 few lying nodes are seen from above, move by up to 0.01."""
-STUCK = 0.25
-"""What lies is stuck if it would go on by less than this part of the way that was seen."""
+STUCK, STUCK_TIME = 0.25, 0.5
+"""What lies is stuck if it would go on by less than this part of the way that was seen, and has not
+been faster for so long [s]: what is pushed sticks and slips."""
 LEAST_FRICTION = 1.0 / 32.0
 """Least part of the friction that is left."""
 FRICTION_HALVINGS = 6
@@ -137,6 +138,10 @@ def _friction_share(
     velocity = restart.velocity[lies].mean(axis=0, dtype=np.float64)[:2]
     speed = np.linalg.norm(velocity)
     if speed < SLIDING:
+        return 1.0
+    since = max(0, frame - round(STUCK_TIME * rate))
+    way = (position[frame] - position[since])[lies].mean(axis=0, dtype=np.float64)[:2]
+    if way @ velocity >= STUCK * speed**2 * (frame - since) / rate:
         return 1.0
     strained = restart.strained_frames
 

@@ -345,3 +345,30 @@ def test_a_hand_that_is_found_beside_what_it_lifts_holds_the_nearest_node() -> N
     beside = SHEET[4] - [0.012 + 0.018, 0.0, 0.0]
     still = hand(np.broadcast_to(beside, (FRAMES, 3)))
     assert len(find_contacts(seen(way), SHEET, still, **fields, gravity=9.81).node) == 0
+
+
+@pytest.mark.parametrize(
+    ("sheet_way", "hand_way", "is_held"),
+    [
+        pytest.param(0.06, 0.06, True, id="together"),
+        pytest.param(0.06, 0.04, True, id="the hand slides over it"),
+        pytest.param(0.06, 0.02, False, id="the hand stays behind"),
+        pytest.param(0.06, 0.0, False, id="it moves by itself"),
+        pytest.param(0.0, 0.06, False, id="it stays where it is"),
+        pytest.param(0.015, 0.015, False, id="by less than held nodes may move"),
+    ],
+)
+def test_what_moves_over_the_ground_with_a_hand_beside_it_is_held(
+    sheet_way: float, hand_way: float, is_held: bool
+) -> None:
+    """A hand that is found 18 mm above the sheet, which lies on the ground: too far to hold it."""
+    what = seen(along(0, ramp(5, 35, sheet_way)))
+    control = hand(SHEET[MIDDLE] + [0.0, 0.0, 0.018] + along(0, ramp(5, 35, hand_way)))
+    fields = {"frame_count": FRAMES, "frame_rate": RATE, "ground": SHEET[:, 2]}
+    contacts = find_contacts(what, SHEET, control, **fields, gravity=9.81)
+    assert at(contacts, MIDDLE) == ([[0, NEVER]] if is_held else [])
+    assert set(contacts.node) == ({MIDDLE} if is_held else set())
+    if is_held:
+        assert contacts.distance.min() == pytest.approx(0.018)
+    # Where nothing weighs anything, nothing is held by friction.
+    assert len(find_contacts(what, SHEET, control, **fields).node) == 0

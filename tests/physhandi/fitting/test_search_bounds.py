@@ -25,6 +25,7 @@ from physhandi.fitting.search_bounds import (
     widened,
 )
 from physhandi.progress import NullProgress
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 from physhandi.simulation.parameters import SimulationParameters
 
 STIFFNESS = SearchVariable(low=1e2, high=1e4, scale="log")
@@ -81,6 +82,31 @@ def test_an_object_is_measured_with_its_grip() -> None:
     assert far.grip == pytest.approx(3 * far.spacing)
     dense = measure_object([held(node, rope(300, 0.002) + np.array([0.0, 0.001, 0.0]))])
     assert dense.grip == dense.spacing
+
+
+@pytest.mark.parametrize(
+    ("touches", "holds", "gap"),
+    [
+        pytest.param((0, 0), (1, NEVER), 0.03, id="for a moment"),
+        pytest.param((0, 1), (2, NEVER), 0.004, id="for most of the time"),
+        pytest.param((1, NEVER), (0, NEVER), 0.004, id="beside what holds from farther away"),
+        pytest.param((2, 2), (7, NEVER), 0.004, id="where else nothing holds"),
+        pytest.param((7, 9), (7, NEVER), 0.0, id="after the fitted frames"),
+    ],
+)
+def test_the_gap_is_that_of_what_holds_most_of_the_time(
+    touches: tuple[int, int], holds: tuple[int, int], gap: float
+) -> None:
+    """One of two contacts began 4 mm from the hand, the other one 30 mm; of three frames."""
+    contacts = ContactIntervals(
+        node=np.array([3, 5], np.int32),
+        control=np.array([0, 1], np.int32),
+        distance=np.array([0.004, 0.03], np.float32),
+        rank=np.zeros(2, np.int32),
+        interval=np.array([touches, holds], np.int32),
+    )
+    problem = held(rope(61, 0.01), np.array([[0.0, 0.0, 0.004], [0.0, 0.0, 0.03]]))
+    assert measure_object([replace(problem, contacts=contacts)]).gap == pytest.approx(gap)
 
 
 def test_intervals_go_with_the_object() -> None:
