@@ -31,8 +31,9 @@ _PATH_REACH = 2.5
 """Node spacings that one step of a path along the object may span."""
 _COARSEST_GRIP = 3.0
 """Most node spacings that the distance of two control nodes counts as: they may be two hands."""
-_FARTHEST_GRIP = 8.0
-"""Node spacings up to which the virtual radius follows control nodes that are away."""
+_NEAR_GRIP, _FARTHEST_GRIP = 1.5, 8.0
+"""Node spacings beyond which, and up to which, the virtual radius follows control nodes that are
+away."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,8 +162,9 @@ def fit_intervals(
 
     The virtual radius then reaches at least half a node spacing farther than twice to the nearest
     control node, and one and a half times as far as control nodes are apart, unless that is farther
-    than hands that hold an object are. A start outside of its scaled interval is scaled likewise,
-    one inside stays.
+    than hands that hold an object are. If that control node is away, all of the interval reaches
+    it: where no spring is laid an object lies still, which fits better than much that moves. A
+    start outside of its scaled interval is scaled likewise, one inside stays.
 
     Returns:
         Settings whose intervals are those of this object, and where its search starts.
@@ -179,6 +181,9 @@ def fit_intervals(
             reach = max(2.0 * size.gap + 0.5 * size.spacing, 1.5 * size.grip)
             farthest = _FARTHEST_GRIP * size.spacing
             high = max(high, _allowed(name, min(reach, farthest)))
+            least = size.gap + 0.5 * size.spacing
+            if size.gap > _NEAR_GRIP * size.spacing and least < high:
+                low = max(low, least)
         intervals[name] = variable.replace(low=low, high=high)
         value = float(getattr(start, name))
         if not low <= value <= high:

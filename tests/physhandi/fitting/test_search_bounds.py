@@ -155,10 +155,14 @@ def test_virtual_springs_are_looked_for_as_far_as_the_controls_are() -> None:
         },
     )
 
-    def widest(control: np.ndarray) -> float:
+    def ends(control: np.ndarray) -> tuple[float, float]:
         size = measure_object([held(node, control)])
         intervals = fit_intervals(config, SimulationParameters(), size)[0].variables
-        return intervals["virtual_connection_radius"].high
+        radius = intervals["virtual_connection_radius"]
+        return radius.low, radius.high
+
+    def widest(control: np.ndarray) -> float:
+        return ends(control)[1]
 
     h = 0.01 * 62 / 61
     beside = np.array([0.0, 1.0, 0.0])
@@ -169,6 +173,9 @@ def test_virtual_springs_are_looked_for_as_far_as_the_controls_are() -> None:
     # 20 mm apart, but for those at the ends.
     assert widest(rope(31, 0.02) + 0.001 * beside) == pytest.approx(1.5 * 0.02 * 32 / 31)
     assert widest(rope(2, 0.6) + 0.001 * beside) == pytest.approx(1.5 * 3 * h)
+    # All of it reaches those that are away, unless they are too far away for any.
+    for gap, low in ((0.001, 0.4 * h), (0.015, 0.4 * h), (0.02, 0.02 + h / 2), (0.5, 0.4 * h)):
+        assert ends(dense + gap * beside)[0] == pytest.approx(low)
 
 
 def test_an_interval_that_a_user_gives_is_taken_as_it_is() -> None:
