@@ -35,6 +35,7 @@ from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import hand_skin
 from physhandi.perception.lifting import hand_points
 from physhandi.progress import Progress
+from physhandi.simulation.contact_intervals import ContactIntervals
 from physhandi.simulation.edits import Edits
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -324,6 +325,19 @@ def load_model(out: Path, name: str) -> SpringMassModel:
     path = out / SequenceFiles(name).model
     with reading(path):
         return SpringMassModel.from_tensors(load_file(path))
+
+
+def load_contacts(out: Path, name: str) -> ContactIntervals | None:
+    """Read what hands hold and when; None if springs are laid at frame 0 for all frames.
+
+    Raises:
+        RunError: If the file is damaged.
+    """
+    path = out / SequenceFiles(name).contacts
+    if not path.is_file():
+        return None
+    with reading(path):
+        return ContactIntervals.from_tensors(load_file(path))
 
 
 def load_restart(out: Path, name: str) -> Restart | None:

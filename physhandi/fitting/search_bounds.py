@@ -31,9 +31,10 @@ _PATH_REACH = 2.5
 """Node spacings that one step of a path along the object may span."""
 _COARSEST_GRIP = 3.0
 """Most node spacings that the distance of two control nodes counts as: they may be two hands."""
-_NEAR_GRIP, _FARTHEST_GRIP = 1.5, 8.0
-"""Node spacings beyond which, and up to which, the virtual radius follows control nodes that are
-away."""
+NEAR_GRIP = 1.5
+"""Node spacings beyond which a control node is away from what it holds."""
+_FARTHEST_GRIP = 8.0
+"""Node spacings up to which the virtual radius follows control nodes that are away."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,14 +79,8 @@ def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
 def _gap(problem: ObjectProblem) -> float:
     if problem.contacts is None:
         return float(KDTree(problem.object_node).query(problem.control[0])[0].min())
-    first, last = problem.contacts.interval.T
-    frame = np.arange(problem.frame_count)[:, None]
-    nearest = np.where(
-        (first <= frame) & (frame <= last), problem.contacts.distance, np.float32(np.inf)
-    ).min(axis=1, initial=np.inf)
     # Most of the time, since what touches for a moment and slides off holds nothing.
-    holding = nearest[np.isfinite(nearest)]
-    return float(np.median(holding)) if len(holding) else 0.0
+    return problem.contacts.median_distance(problem.frame_count)
 
 
 def neighbor_distance(node: Float[ndarray, "node 3"]) -> float:
@@ -182,7 +177,7 @@ def fit_intervals(
             farthest = _FARTHEST_GRIP * size.spacing
             high = max(high, _allowed(name, min(reach, farthest)))
             least = size.gap + 0.5 * size.spacing
-            if size.gap > _NEAR_GRIP * size.spacing and least < high:
+            if size.gap > NEAR_GRIP * size.spacing and least < high:
                 low = max(low, least)
         intervals[name] = variable.replace(low=low, high=high)
         value = float(getattr(start, name))

@@ -46,6 +46,20 @@ class ContactIntervals:
         order = np.lexsort((self.interval[rows, 0], self.control[rows], self.node[rows]))
         return self._part(rows[order])
 
+    def median_distance(self, frame_count: int) -> float:
+        """Compute how far apart are, most of the time, what holds and what is held [m].
+
+        That of the nearest pair that holds in a frame, when it began to, and the median over the
+        first frames in which any does; 0 if none does.
+        """
+        first, last = self.interval.T
+        frame = np.arange(frame_count)[:, None]
+        nearest = np.where(
+            (first <= frame) & (frame <= last), self.distance, np.float32(np.inf)
+        ).min(axis=1, initial=np.inf)
+        holding = nearest[np.isfinite(nearest)]
+        return float(np.median(holding)) if len(holding) else 0.0
+
     def spring_nodes(self, node_count: int) -> Int32[ndarray, "pair 2"]:
         """Give the two nodes of each pair: object node, and `node_count` + control."""
         return np.stack([self.node, node_count + self.control], axis=1).astype(np.int32)

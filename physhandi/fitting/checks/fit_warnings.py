@@ -23,7 +23,12 @@ from physhandi.data.sequence import Sequence
 from physhandi.fitting import artefacts
 from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, shows_palm, skipped_object
 from physhandi.fitting.config import INTERVALS, SearchVariable
-from physhandi.fitting.search_bounds import bounds_met, interval_text
+from physhandi.fitting.search_bounds import (
+    NEAR_GRIP,
+    bounds_met,
+    interval_text,
+    neighbor_distance,
+)
 from physhandi.fitting.spring_optimisation import unsteadiness
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import PARAMETERS
@@ -44,6 +49,7 @@ Code = Literal[
     "hand_left_out",
     "hand_filled",
     "hand_by_one_view",
+    "hand_away",
 ]
 MARGIN, LEAST_EXCESS = 0.1, 5e-4
 """Part of a baseline's error, and length [m], by which a fit must exceed it to be called worse."""
@@ -127,7 +133,11 @@ def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> li
     doubts += _worse_than_baselines(scores)
     doubts += _doubts_of_shape(out)
     model = artefacts.load_model(out, sequence.name)
-    doubts += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
+    doubts += [
+        *_empty_hands(out, sequence, model),
+        *_away(out, sequence, model),
+        *_loose_nodes(model),
+    ]
     if (out / files.observation("point")).is_file():
         doubts += _few_observations(out, sequence)
     return [*doubts, *_unseen_hands(out, sequence), *_lone_views(out, sequence)]
@@ -249,6 +259,24 @@ def _empty_hands(out: Path, sequence: Sequence, model: SpringMassModel) -> Itera
                 message=f"The {side} hand holds nothing: no virtual spring joins it to the object, "
                 f"so it does not move it. Check where it is in the viewer; {remedy}.",
             )
+
+
+def _away(out: Path, sequence: Sequence, model: SpringMassModel) -> Iterator[FitWarning]:
+    """Tell if hands are where they could not hold what they move."""
+    contacts = artefacts.load_contacts(out, sequence.name)
+    if contacts is None or not sequence.hands:
+        return
+    spacing = neighbor_distance(model.object_node.astype(np.float64))
+    gap = contacts.median_distance(len(sequence.reconstruction_frames))
+    if gap > NEAR_GRIP * spacing:
+        yield FitWarning(
+            code="hand_away",
+            message=f"Most of the time, what a hand moves was {1e3 * gap:.0f} mm from it when it "
+            f"took hold, where nodes are {1e3 * spacing:.0f} mm apart: a hand is likely not where "
+            "it was fitted. The object follows it all the same, but not as surely. Look at the "
+            "hands over the video; larger images, or keypoints of another detector (keypoint.npy), "
+            "help.",
+        )
 
 
 def _unseen_hands(out: Path, sequence: Sequence) -> Iterator[FitWarning]:

@@ -17,6 +17,7 @@ from physhandi.errors import RunError
 from physhandi.fitting.checks.fit_warnings import fit_warnings, with_warnings
 from physhandi.metrics.report import score_run
 from physhandi.run import warnings_in
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
@@ -98,6 +99,37 @@ def found(stored: Stored, sequence: Sequence) -> dict[str, list[str]]:
     for warning in fit_warnings(stored.out, sequence, score_run(stored.out, sequence)):
         messages.setdefault(warning.code, []).append(warning.message)
     return messages
+
+
+@pytest.mark.parametrize(
+    ("distance", "first", "last", "is_told"),
+    [
+        pytest.param(0.035, 0, NEVER, True, id="away"),
+        pytest.param(0.035, 2, NEVER, True, id="for most of the fitted frames"),
+        pytest.param(0.035, 5, NEVER, False, id="for few of them"),
+        pytest.param(0.028, 0, NEVER, False, id="near"),
+        pytest.param(0.035, FITTED, NEVER, False, id="only later"),
+    ],
+)
+def test_a_hand_that_is_away_from_what_it_moves_is_told(
+    stored: Stored, sequence: Sequence, distance: float, first: int, last: int, is_told: bool
+) -> None:
+    """Nodes are 20 mm apart; before the contact that matters, another one touches."""
+    contacts = ContactIntervals(
+        node=np.array([0, 5], np.int32),
+        control=np.array([0, 1], np.int32),
+        distance=np.array([0.005, distance], np.float32),
+        rank=np.zeros(2, np.int32),
+        interval=np.array([[0, first - 1], [first, last]], np.int32),
+    )
+    save_file(contacts.to_tensors(), stored.folder / "contacts.safetensors")
+    messages = found(stored, sequence).get("hand_away", [])
+    assert len(messages) == is_told
+    if is_told:
+        assert "was 35 mm from it when it took hold, where nodes are 20 mm apart" in messages[0]
+        (stored.folder / "contacts.safetensors").write_bytes(b"no tensors")
+        with pytest.raises(RunError, match=r"contacts\.safetensors"):
+            fit_warnings(stored.out, sequence, {})
 
 
 def test_a_hand_that_one_view_alone_places_is_told(
