@@ -137,7 +137,9 @@ def _friction_share(
         return 1.0
     velocity = restart.velocity[lies].mean(axis=0, dtype=np.float64)[:2]
     speed = np.linalg.norm(velocity)
-    if speed < SLIDING:
+    # The mean of a part that lies still is that of its tracks' few worst errors.
+    most = np.median(restart.velocity[lies, :2] @ velocity) / speed if speed > 0.0 else 0.0
+    if min(speed, most) < SLIDING:
         return 1.0
     since = max(0, frame - round(STUCK_TIME * rate))
     way = (position[frame] - position[since])[lies].mean(axis=0, dtype=np.float64)[:2]
@@ -158,8 +160,9 @@ def _friction_share(
 
     if slides(1.0) >= STUCK:
         return 1.0
-    if slides(LEAST_FRICTION) <= 1.0:
-        return LEAST_FRICTION
+    fastest = slides(LEAST_FRICTION)
+    if fastest <= 1.0:  # If it hardly slides even so, it is not friction that holds it.
+        return LEAST_FRICTION if fastest >= STUCK else 1.0
     low, high = np.log(LEAST_FRICTION), 0.0
     for _ in range(FRICTION_HALVINGS):
         middle = 0.5 * (low + high)

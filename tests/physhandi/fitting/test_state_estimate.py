@@ -141,24 +141,26 @@ def dragged(
     pace: float = PACE,
     pull: float = FORCE,
     lifted: int = 0,
+    still: int = 0,
     frames: int = 9,
     jerk: float = 0.0,
 ) -> tuple[float, np.ndarray]:
     """Give the friction that is left for a weight on the ground, and where it goes with that.
 
     A hand pulls it by a soft spring and moves as fast as it is seen to slide; at first by `jerk`
-    more, of which it slips.
+    more, of which it slips. Other weights are in the air, or are seen to lie still.
     """
     rate, last = 30.0, 4
-    node = np.zeros((1 + lifted, 3))
-    node[1:, 2] = 0.3
+    node = np.zeros((1 + still + lifted, 3))
+    node[:, 1] = np.arange(len(node))
+    node[1 + still :, 2] = 0.3
     time = np.arange(frames) / rate
     control = np.zeros((frames, 1, 3))
     control[:, 0, 0] = 1.0 + pull / 40.0 + pace * (time - last / rate)
     control[:3, 0, 0] += jerk / 40.0
     scene = bare_scene(
         node,
-        springs=[[0, 1 + lifted]],
+        springs=[[0, len(node)]],
         rest=[1.0],
         stiffness=[40.0],
         damping=[0.0],
@@ -169,12 +171,12 @@ def dragged(
         friction=friction,
         frame_rate=rate,
     )
-    point = np.zeros((frames, 1 + lifted, 3), np.float32)
+    point = np.zeros((frames, *node.shape), np.float32)
     point[:] = node
     point[:, 0, 0] = pace * np.maximum(time - 1 / rate, 0.0)
     seen = np.ones(point.shape[:2], bool)
     observation = ObjectObservation(
-        point=point, is_visible=seen, is_motion_valid=seen, node_of_track=np.arange(1 + lifted)
+        point=point, is_visible=seen, is_motion_valid=seen, node_of_track=np.arange(len(node))
     )
     model, parameters = as_model(scene)
     found, held = (
@@ -204,9 +206,11 @@ def test_what_is_seen_to_slide_slides_on_with_the_friction_that_its_pull_overcom
         {"pace": 0.01},  # As slow as tracks of what lies still.
         {"friction": 0.1},  # It slides by itself.
         {"lifted": 10},  # Next to nothing of it lies.
+        {"still": 2, "pace": 0.2},  # Most of what lies is seen to lie still.
+        {"pull": -FORCE},  # The hand pulls it back, so it is no friction that holds it.
         {"frames": 5},  # Nothing is to be predicted.
     ],
-    ids=["slow", "slides", "lifted", "last"],
+    ids=["slow", "slides", "lifted", "still", "back", "last"],
 )
 def test_friction_stays_where_nothing_tells_that_there_is_less(settings) -> None:
     assert dragged(**settings)[0] == 1.0
