@@ -26,7 +26,6 @@ from physhandi.data.environment import processor_name
 from physhandi.data.files import write_json, write_yaml
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
-from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.truth import read_truth
 from physhandi.data.view import View
 from physhandi.errors import CancelledError, PhysHandiError, RunError, UsageError, describe
@@ -509,7 +508,7 @@ def _track_figures(sequence: Sequence, surface: Any) -> dict[str, Any]:
 def fit_scene(
     place: ScenePlace, given: str, search_seed: int, order: CaptureOrder, progress: Progress
 ) -> dict[str, Any]:
-    """Fit the import, or the recording with exact masks and tracks and anyone's keypoints."""
+    """Fit the import, or the recording with exact masks and tracks and either's keypoints."""
     from physhandi.api import reconstruct
     from physhandi.synthetic.suite.methods import SEARCH_SEED
     from physhandi.synthetic.suite.variants import make_variant
@@ -534,16 +533,14 @@ def fit_scene(
 
 def _with_keypoints(sequence: Sequence, other: Sequence, folder: Path) -> Sequence:
     """Write a sequence once more, with the hand keypoints of another of the same pictures."""
+    from physhandi.synthetic.suite.variants import VariantChange, write_variant
+
     if folder.is_dir():
         return Sequence.load(folder)
-    with SequenceWriter(folder) as writer:
-        for path in sorted(sequence.folder.rglob("*")):
-            if path.is_file() and path.name not in (FILE, "keypoint.npy"):
-                writer.copy(path.relative_to(sequence.folder).as_posix(), path)
-        for view in other.views:
-            if view.keypoint is not None:
-                writer.save_array(f"views/{view.name}/keypoint.npy", view.keypoint)
-        return writer.finish(sequence.meta)
+    shown = {f"views/{view.name}/keypoint.npy": view.keypoint for view in other.views}
+    arrays = {file: keypoint for file, keypoint in shown.items() if keypoint is not None}
+    change = VariantChange(meta=sequence.meta, arrays=arrays, without=tuple(shown))
+    return write_variant(sequence, change, folder)
 
 
 def score_fit(

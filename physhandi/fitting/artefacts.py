@@ -3,8 +3,9 @@
 Paths are relative to the output folder of one attempt; docs/formats.md lists them.
 """
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
+from typing import TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -41,6 +42,7 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
 
+Stored = TypeVar("Stored")
 STORED_CLOUD = 500
 """Most points of one frame's cloud that a run stores, evenly picked, unless they are markers."""
 STORED_HAND = 300
@@ -299,11 +301,15 @@ def load_splats(out: Path) -> Splats | None:
     Raises:
         RunError: If the file is damaged.
     """
-    path = out / SPLATS_FILE
+    return _read_if_there(out / SPLATS_FILE, Splats.from_tensors)
+
+
+def _read_if_there(path: Path, read: Callable[[dict[str, ndarray]], Stored]) -> Stored | None:
+    """Read the arrays of a file that not every run has; None if it is not there."""
     if not path.is_file():
         return None
     with reading(path):
-        return Splats.from_tensors(load_file(path))
+        return read(load_file(path))
 
 
 def save_model(output: Attempt, name: str, model: SpringMassModel) -> None:
@@ -333,11 +339,7 @@ def load_contacts(out: Path, name: str) -> ContactIntervals | None:
     Raises:
         RunError: If the file is damaged.
     """
-    path = out / SequenceFiles(name).contacts
-    if not path.is_file():
-        return None
-    with reading(path):
-        return ContactIntervals.from_tensors(load_file(path))
+    return _read_if_there(out / SequenceFiles(name).contacts, ContactIntervals.from_tensors)
 
 
 def load_restart(out: Path, name: str) -> Restart | None:
@@ -346,11 +348,7 @@ def load_restart(out: Path, name: str) -> Restart | None:
     Raises:
         RunError: If the file is damaged.
     """
-    path = out / SequenceFiles(name).restart
-    if not path.is_file():
-        return None
-    with reading(path):
-        return Restart.from_tensors(load_file(path))
+    return _read_if_there(out / SequenceFiles(name).restart, Restart.from_tensors)
 
 
 def save_hand_observation(

@@ -138,8 +138,7 @@ def _friction_share(
     velocity = restart.velocity[lies].mean(axis=0, dtype=np.float64)[:2]
     speed = np.linalg.norm(velocity)
     # The mean of a part that lies still is that of its tracks' few worst errors.
-    most = np.median(restart.velocity[lies, :2] @ velocity) / speed if speed > 0.0 else 0.0
-    if min(speed, most) < SLIDING:
+    if speed < SLIDING or np.median(restart.velocity[lies, :2] @ velocity) < SLIDING * speed:
         return 1.0
     since = max(0, frame - round(STUCK_TIME * rate))
     way = (position[frame] - position[since])[lies].mean(axis=0, dtype=np.float64)[:2]

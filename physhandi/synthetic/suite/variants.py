@@ -221,6 +221,11 @@ def make_variant(recording: Sequence, name: str, folder: Path) -> Sequence:
     if target.is_dir():
         return Sequence.load(target)
     change = VARIANTS[name](recording, np.random.default_rng(noise_seed(recording, name)))
+    return write_variant(recording, change, target)
+
+
+def write_variant(recording: Sequence, change: VariantChange, target: Path) -> Sequence:
+    """Write what a method may read of a recording, changed, into a folder that is not there yet."""
     left_out = (*change.without, *change.arrays, *change.images)
     with SequenceWriter(target) as writer:
         for path in sorted(recording.folder.rglob("*")):
