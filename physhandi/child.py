@@ -257,14 +257,24 @@ class Child:
 
         Args:
             time_limit_s: That time [s].
+
+        Raises:
+            ChildEndedError: If it did not.
         """
         timer = threading.Timer(time_limit_s, self._end_late)
         timer.daemon = True
+        begin = time.monotonic()
         timer.start()
         try:
             yield
         finally:
             timer.cancel()
+            timer.join()
+        # On a busy machine an answer may come while the timer still waits for a processor, or is
+        # about to kill what has answered and would be asked again.
+        if self._is_late or time.monotonic() - begin > time_limit_s:
+            self._end_late()
+            raise ChildEndedError(self._module, -signal.SIGKILL, "", is_late=True)
 
     def _end_late(self) -> None:
         self._is_late = True

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from support.waiting import until
 from physhandi import child as child_module
 from physhandi.child import (
     PACKAGE_ROOT,
+    AnsweringChild,
     Child,
     ChildEndedError,
     copy_log,
@@ -105,6 +107,30 @@ def test_a_child_that_takes_too_long_is_killed_with_all_that_it_started() -> Non
     with start("forever", time_limit_s=0.01) as late, pytest.raises(ChildEndedError) as raised:
         list(late.messages())
     assert raised.value.is_late
+
+
+def test_an_answer_that_comes_too_late_is_none_although_the_timer_is_later_still(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class LaterTimer(threading.Timer):
+        """On a busy machine: it waits for a processor until the answer is there."""
+
+        kills = False
+
+        def run(self) -> None:
+            self.finished.wait()
+            if self.kills:
+                self.function()
+
+    monkeypatch.setattr(threading, "Timer", LaterTimer)
+    answering = AnsweringChild("support.child_deeds", "echo")
+    for LaterTimer.kills, limit_s in ((False, 0.0), (True, 300.0)):
+        with pytest.raises(ChildEndedError) as raised:
+            answering.ask(1, limit_s)
+        assert raised.value.is_late
+    LaterTimer.kills = False
+    assert answering.ask(2, 300.0) == {"heard": 2}
+    answering.close()
 
 
 def test_a_child_ends_with_its_parent_unless_it_outlives_it() -> None:
