@@ -475,9 +475,10 @@ def test_sequences_are_checked_file_by_file(terminal: Terminal) -> None:
     assert terminal("check", "sheet") == 0
     assert "hand_reconstruction: will be skipped, which is no loss" in terminal.out
     assert "first_order: ready" in terminal.out
+    shutil.copytree(meta.parent, meta.parents[1] / "whole")
     marker = terminal.data_dir / "sequences" / "sheet" / "marker.npy"
     marker.write_bytes(marker.read_bytes()[:-8])
-    assert terminal("check", "sheet", "towel_fold") == 1
+    assert terminal("check", "sheet", "whole") == 1
     assert "marker.npy" in terminal.out
     assert "at least one sequence" in terminal.refused(2, "check")
 

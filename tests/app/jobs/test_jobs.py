@@ -123,10 +123,15 @@ def test_what_cannot_be_launched_leaves_no_run(desk: Desk) -> None:
     assert [item for item in desk.catalog.runs() if not item.is_bundled] == []
 
 
-def test_runs_wait_in_order_while_the_only_slot_is_taken(desk: Desk) -> None:
+def test_runs_wait_in_order_and_are_cancelled_there_while_the_only_slot_is_taken(
+    desk: Desk,
+) -> None:
     first = desk.launch("wait 1")
     desk.until(first, "running")
-    waiting = [desk.launch("wait 2"), desk.launch("wait 3")]
+    cancelled, *waiting = [desk.launch(f"wait {number}") for number in (2, 3, 4)]
+    until(lambda: [desk.view(r).place for r in (cancelled, *waiting)] == [1, 2, 3])
+    desk.scheduler.cancel(cancelled)
+    assert desk.state(cancelled) == "cancelled"
     until(lambda: [desk.view(run_id).place for run_id in waiting] == [1, 2])
     assert [desk.state(run_id) for run_id in waiting] == ["queued", "queued"]
     assert "one fit runs at a time" in desk.view(waiting[1]).reason
@@ -141,6 +146,9 @@ def test_runs_wait_in_order_while_the_only_slot_is_taken(desk: Desk) -> None:
     desk.until(waiting[1], "succeeded")
     ends = [read_events(desk.run(r).folder)[0][-1]["time"] for r in (first, *waiting)]
     assert ends == sorted(ends)
+    # It was never started, though others have passed it.
+    assert desk.state(cancelled) == "cancelled"
+    assert read_events(desk.run(cancelled).folder)[0] == []
 
 
 def test_two_slots_run_two_fits_side_by_side(desks: Callable[..., Desk]) -> None:
@@ -184,27 +192,6 @@ def device_of(desk: Desk, run_id: str) -> str:
     ticket = read_ticket(desk.run(run_id).folder / STARTED)
     assert ticket is not None
     return ticket.device
-
-
-def test_the_line_has_an_end(desks: Callable[..., Desk]) -> None:
-    desk = desks(waiting_fits=1)
-    desk.until(desk.launch("wait"), "running")
-    desk.launch("wait")
-    with pytest.raises(PhysHandiError, match="1 fits wait already"):
-        desk.launch("wait")
-
-
-def test_a_run_that_waits_is_cancelled_without_starting(desk: Desk) -> None:
-    first = desk.launch("wait")
-    desk.until(first, "running")
-    second = desk.launch("wait")
-    desk.scheduler.cancel(second)
-    assert desk.state(second) == "cancelled"
-    (desk.run(first).folder / "go").touch()
-    desk.until(first, "succeeded")
-    desk.scheduler._step()
-    assert desk.state(second) == "cancelled"
-    assert read_events(desk.run(second).folder)[0] == []
 
 
 def test_a_polite_worker_is_cancelled_at_its_next_report_and_resumed_later(desk: Desk) -> None:
@@ -264,16 +251,20 @@ def test_a_fit_is_cancelled_while_its_program_is_loading(desk: Desk) -> None:
     until(lambda: supervisor_of(run.folder) is None)
 
 
-def test_a_closed_server_starts_nothing_more(desk: Desk) -> None:
-    running = desk.launch("wait")
-    desk.until(running, "running")
-    waiting = desk.launch("publish")
-    desk.scheduler.shutdown()
-    folder = desk.run(running).folder
+def test_a_closed_server_starts_nothing_more_and_the_next_tells_how_a_run_ended_meanwhile(
+    desks: Callable[..., Desk],
+) -> None:
+    closed = desks()
+    running = closed.launch("wait")
+    closed.until(running, "running")
+    waiting = closed.launch("publish")
+    closed.scheduler.shutdown()
+    folder = closed.run(running).folder
     (folder / "go").touch()
     until(lambda: supervisor_of(folder) is None)
-    assert not desk.scheduler._thread.is_alive()
-    assert (desk.run(waiting).folder / "queued.json").is_file()
+    assert not closed.scheduler._thread.is_alive()
+    assert (closed.run(waiting).folder / "queued.json").is_file()
+    assert desks().state(running) == "succeeded"
 
 
 def test_a_killed_worker_fails_with_a_reason_and_takes_its_children_along(desk: Desk) -> None:
@@ -370,19 +361,6 @@ def test_a_restarted_server_finds_running_and_waiting_runs_again(
     after.scheduler.cancel(running)
     after.until(running, "cancelled")
     after.until(waiting, "succeeded")
-
-
-def test_a_run_that_ended_while_no_server_was_there_is_told_as_it_ended(
-    desks: Callable[..., Desk],
-) -> None:
-    before = desks()
-    run_id = before.launch("wait")
-    before.until(run_id, "running")
-    before.scheduler.shutdown()
-    folder = before.run(run_id).folder
-    (folder / "go").touch()
-    until(lambda: supervisor_of(folder) is None)
-    assert desks().state(run_id) == "succeeded"
 
 
 def test_two_servers_never_share_a_data_folder(desks: Callable[..., Desk]) -> None:
