@@ -16,7 +16,7 @@ _LONGEST_REST = 0.1
 
 
 def until(
-    ask: Callable[[], Answer], tell: Callable[[], object] = str, *, interval: float = 0.01
+    ask: Callable[[], Answer], tell: Callable[[], object] = str, *, interval: float = 0.02
 ) -> Answer:
     """Ask until the answer is true, and return it.
 
