@@ -1,14 +1,16 @@
 """Base of all live scenes: a viser server of their own, an owner, and connected viewers."""
 
 import asyncio
+import functools
 import threading
 import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any, Protocol, get_type_hints
 
 import rich
 import viser
+import viser._assignable_props_api as handles
 import viser._messages as messages
 
 from app.settings import WEB_ASSETS
@@ -25,6 +27,10 @@ was recorded as (50, 136, 152) is seen as (43, 136, 160); with all of it as (117
 _FROM_BELOW = 0.9
 """Intensity of the light from below. The environment map is nearly black there: of the same towel's
 underside (1, 23, 29) was seen, and (0, 80, 94) is with this."""
+
+# Viser looks up for every handle what types the properties of its class have, though these stay:
+# a quarter of the time in which a scene is opened.
+handles.get_type_hints = functools.cache(get_type_hints)
 
 
 class _LoopEvent(asyncio.Event):
