@@ -118,6 +118,31 @@ def device(request):
 
 
 @pytest.fixture(scope="session")
+def live_process():
+    """Let every `Sessions` of the tests simulate in the same process."""
+    from support.viewer.shared_live import shared_live
+
+    with shared_live():
+        yield
+
+
+@pytest.fixture(scope="session")
+def sheet_folder(tmp_path_factory):
+    """A recording of `sheet_sequence`, to copy."""
+    from support.inputs.sheet_sequence import write_sheet
+
+    return write_sheet(tmp_path_factory.mktemp("sheets") / "sheet").folder
+
+
+@pytest.fixture(scope="session")
+def fitted_folder(tmp_path_factory, sheet_folder):
+    """A finished run of that recording, to copy."""
+    from support.server.server_world import fit_sheet
+
+    return fit_sheet(tmp_path_factory.mktemp("fits") / "fitted", sheet_folder).folder
+
+
+@pytest.fixture(scope="session")
 def mano_folder(tmp_path_factory):
     """Import a made-up MANO of both sides into a folder."""
     from support.inputs.mano_file import write_mano

@@ -4,19 +4,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from support.inputs.sheet_sequence import write_sheet
-from support.server.server_world import World, fit_sheet, make_world
-from support.viewer.shared_live import live_process as live_process
+from support.server.server_world import World, make_world
 
 
-@pytest.fixture(scope="session")
-def sheet_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sheet(tmp_path_factory.mktemp("sheets") / "sheet").folder
-
-
-@pytest.fixture(scope="session")
-def fitted_folder(tmp_path_factory: pytest.TempPathFactory, sheet_folder: Path) -> Path:
-    return fit_sheet(tmp_path_factory.mktemp("fits") / "fitted", sheet_folder).folder
+@pytest.fixture(scope="session", autouse=True)
+def one_live_process(live_process: None) -> None:
+    """Every `Sessions` of these tests simulates in the same process."""
 
 
 @pytest.fixture(scope="module")

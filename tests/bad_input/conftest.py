@@ -6,28 +6,21 @@ from pathlib import Path
 
 import pytest
 from support.hostile.bad_input_world import Terminal, write_filmed
-from support.inputs.sheet_sequence import write_sheet
-from support.server.server_world import fit_sheet, tiny_config
-from support.viewer.shared_live import live_process as live_process
+from support.server.server_world import tiny_config
 
 from app.cli import runs
 
 Copy = Callable[[], Path]
 
 
-@pytest.fixture(scope="session")
-def sheet_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sheet(tmp_path_factory.mktemp("sheets") / "sheet").folder
+@pytest.fixture(scope="session", autouse=True)
+def one_live_process(live_process: None) -> None:
+    """Every `Sessions` of these tests simulates in the same process."""
 
 
 @pytest.fixture(scope="session")
 def filmed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_filmed(tmp_path_factory.mktemp("films") / "filmed").folder
-
-
-@pytest.fixture(scope="session")
-def fitted_folder(tmp_path_factory: pytest.TempPathFactory, sheet_folder: Path) -> Path:
-    return fit_sheet(tmp_path_factory.mktemp("fits") / "fitted", sheet_folder).folder
 
 
 @pytest.fixture

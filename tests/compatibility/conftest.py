@@ -7,6 +7,11 @@ from support.inputs.old_data import OldFolder, read_record, serve, settle, unpac
 from support.server.server_world import World
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_live_process(live_process: None) -> None:
+    """Every `Sessions` of these tests simulates in the same process."""
+
+
 @pytest.fixture(scope="session")
 def old(tmp_path_factory: pytest.TempPathFactory) -> OldFolder:
     """The folder for tests that only read."""

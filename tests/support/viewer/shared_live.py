@@ -1,6 +1,7 @@
 """One live simulation process for all servers of a test process, which take turns anyway."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -23,9 +24,9 @@ class LentClient:
         self.is_closed = True
 
 
-@pytest.fixture(scope="session", autouse=True)
-def live_process() -> Iterator[None]:
-    """Let every `Sessions` of the tests simulate in the same process."""
+@contextmanager
+def shared_live() -> Generator[None]:
+    """Let every `Sessions` simulate in the same process, which ends at the end."""
     client = SimulationClient()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sessions, "SimulationClient", lambda _device: LentClient(client))
