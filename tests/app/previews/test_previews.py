@@ -168,22 +168,22 @@ def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -
             for of, moves in product((sheet, fitted), (False, True))
         ]
         old = previews.file(*other, is_moving=True)
-    still, moving, _, moving_run = (path for path in files if path is not None)
-    see_what_is_shown(still, moving)
+        still, moving, _, moving_run = (path for path in files if path is not None)
+        see_what_is_shown(still, moving)
 
-    # Of which one picture was cleared away both are drawn again, and what has changed.
-    for path in (still, moving_run):
-        path.unlink()
-    os.utime(sequences / "other/sequence.yaml", ns=(1, 1))
-    with drawn(world, sheet, fitted, other) as previews:
+        # Of which one picture was cleared away both are drawn again, and what has changed.
+        for path in (still, moving_run):
+            path.unlink()
+        os.utime(sequences / "other/sequence.yaml", ns=(1, 1))
+        with previews._lock:  # So that all are drawn by one process.
+            for of in (sheet, fitted, other):
+                assert previews.look(*of).state == "pending"
+        for of in (sheet, fitted, other):
+            until_ready(previews, *of)
         assert still.is_file()
         assert moving_run.is_file()
         until(lambda: len(list(kept.glob("sequence-other-*.moving.webp"))) == 1)
         assert previews.file(*other, is_moving=True) != old
-        shutil.rmtree(kept)
-        kept.mkdir()
-        assert previews.look(*fitted).state == "pending"
-        until_ready(previews, *fitted)
         assert previews.look(*fitted).moving.startswith("runs/fitted/preview?v=")
     assert sorted(world.settings.run_dir.rglob("*")) == before
 
