@@ -12,6 +12,7 @@ from support.viewer.viewer_world import FRAMES
 
 from app.benchmarks import latency
 from app.benchmarks.latency import measure_latency
+from app.viewer import sessions
 from physhandi.errors import MissingInputError, SimulationError
 from physhandi.run import Run
 
@@ -77,6 +78,8 @@ def test_a_run_that_is_gone_fails_by_name(run: Run, monkeypatch: pytest.MonkeyPa
         return real(**(about | {"run": Path("/nowhere/at-all")}))
 
     monkeypatch.setattr(latency, "LiveRequest", elsewhere)
+    # The process of all tests: it answers as one of its own would.
+    monkeypatch.setattr(latency, "SimulationClient", sessions.SimulationClient)
     with pytest.raises(SimulationError, match=r"failed: .*at-all"):
         measure_latency(run, "lift", moves=1)
 
