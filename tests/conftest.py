@@ -1,6 +1,7 @@
 """Fixtures that all tests share."""
 
 import atexit
+import dataclasses
 import functools
 import gc
 import inspect
@@ -9,6 +10,7 @@ import os
 import sys
 from pathlib import Path
 
+import beartype
 import jaxtyping
 import pytest
 import warp as wp
@@ -17,9 +19,9 @@ from support.inputs.recordings import recording
 BROWSERS = ("tests/e2e/", "tests/app/benchmarks/test_viewer_benchmark.py")
 """Files whose tests start browsers."""
 
-CHECKED_FIRST, CHECKED_EVERY = 20, 64
+CHECKED_FIRST, CHECKED_EVERY, MADE_EVERY = 20, 64, 8
 """Calls of each function, in each process, whose arguments and results have shapes checked: the
-first 20, and then each 64th."""
+first 20, and then each 64th; of constructors each eighth."""
 
 
 def pytest_configure(config):
@@ -39,21 +41,35 @@ def pytest_configure(config):
 def _checked_at_times(jaxtyped):
     """Check shapes in some of a function's calls: fits call some a hundred thousand times.
 
-    What checks them is made at the first call, since most functions are called by few tests.
+    What checks them is made at the first call, since most functions are called by few tests. It is
+    one wrapper of beartype, which sees arguments and result; jaxtyping by itself makes two.
     """
+    wrong = beartype.BeartypeConf(violation_type=jaxtyping.TypeCheckError)
+    calls_of = {}
 
     def decorator(function=None, **options):
         if function is None:
             return functools.partial(decorator, **options)
-        if not inspect.isfunction(function):  # Classes, whose constructors are checked throughout.
+        if inspect.isclass(function):
+            made = vars(function).get("__init__")
+            if dataclasses.is_dataclass(function) and not hasattr(made, "__wrapped__"):
+                function.__init__ = limited(made, MADE_EVERY)
+            return function
+        if not inspect.isfunction(function):
             return jaxtyped(function, **options)
-        checked = functools.cache(lambda: jaxtyped(function, **options))
-        calls = itertools.count()
+        return limited(function, CHECKED_EVERY)
+
+    def limited(function, every):
+        checked = functools.cache(
+            lambda: jaxtyped(beartype.beartype(function, conf=wrong), typechecker=None)
+        )
+        # A function in another one is made anew by each call of that, and counts on.
+        calls = calls_of.setdefault((function.__module__, function.__code__), itertools.count())
 
         @functools.wraps(function)
         def call(*args, **kwargs):
             number = next(calls)
-            is_checked = number < CHECKED_FIRST or number % CHECKED_EVERY == 0
+            is_checked = number < CHECKED_FIRST or number % every == 0
             return (checked() if is_checked else function)(*args, **kwargs)
 
         return call
