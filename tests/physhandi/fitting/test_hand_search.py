@@ -41,11 +41,11 @@ def test_one_view_shows_a_fist_that_keypoints_alone_leave_wrong(tmp_path: Path) 
     truth, model = _moving(FIST, 2), load_hand_model("right")
     sequence, _ = _filmed(tmp_path / "a", truth)
     error = {}
-    for searched in (80, 0):
-        config = HandFitConfig(iterations=100, search_iterations=searched, depth_iterations=60)
+    for searched in (20, 0):
+        config = HandFitConfig(iterations=40, search_iterations=searched, depth_iterations=20)
         found = reconstruct_hands(sequence, config).motions[0].keypoints(model)
         error[searched] = np.linalg.norm(found - truth.keypoints(model), axis=-1).mean()
-    assert error[80] < 0.006
+    assert error[20] < 0.006
     assert error[0] > 0.012
 
 
