@@ -93,12 +93,12 @@ def test_a_hand_that_one_view_does_not_detect_is_shown_to_it_by_the_other(tmp_pa
 
 @pytest.mark.parametrize("unsure", ["side", "top"])
 def test_what_one_view_takes_for_a_hand_yields_to_a_view_that_is_surer(tmp_path, unsure):
-    sequence, true = write_disc(tmp_path / "held", hand=True)
+    sequence, true = write_disc(tmp_path / "held", hand=True, frames=6)
     path = sequence.folder / "views" / unsure / "keypoint.npy"
     keypoint = np.load(path)
     # On the table, 0.1 m and more from the hand; surer than the other view, but in few frames.
     keypoint[:, :, :, 0] -= 55
-    keypoint[3:, :, :, 2], keypoint[:3, :, :, 2] = 0.5, 1.0
+    keypoint[2:, :, :, 2], keypoint[:2, :, :, 2] = 0.5, 1.0
     np.save(path, keypoint)
     other = ({"side", "top"} - {unsure}).pop()
     right = np.load(sequence.folder / "views" / other / "keypoint.npy")
@@ -296,7 +296,7 @@ def test_without_a_click_hands_alone_are_found(held_disc):
 
 
 def test_a_view_without_depth_is_judged_in_smaller_images(tmp_path, monkeypatch):
-    sequence, true = write_disc(tmp_path / "held", hand=True)
+    sequence, true = write_disc(tmp_path / "held", hand=True, frames=5)
     shutil.rmtree(sequence.folder / "views" / "side" / "depth")
     blind = type(sequence).load(sequence.folder)
     sizes = []
