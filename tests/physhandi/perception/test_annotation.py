@@ -27,7 +27,7 @@ def content(folder: Path) -> dict[str, str]:
 
 
 def test_one_click_makes_a_sequence_whose_object_can_be_observed(tmp_path):
-    sequence, true = write_disc(tmp_path / "disc", hand=True)
+    sequence, true = write_disc(tmp_path / "disc", hand=True, frames=5)
     assert sequence.missing("object") == ["mask"]
     view, frame, x, y = disc_click()
     before = content(sequence.folder)
@@ -41,7 +41,7 @@ def test_one_click_makes_a_sequence_whose_object_can_be_observed(tmp_path):
     }
     assert done.provenance["masks"] == done.provenance["tracks"] == about
     for one in done.views:
-        both = [(one.mask(f) == 1) & (true[one.name][f] == 1) for f in range(FRAMES)]
+        both = [(one.mask(f) == 1) & (true[one.name][f] == 1) for f in range(5)]
         assert np.sum(both) > 0.85 * (true[one.name] == 1).sum()
     cloud = np.concatenate(observe_object(done).cloud)
     assert abs(np.median(cloud[:, 2]) - 0.03) < 0.003

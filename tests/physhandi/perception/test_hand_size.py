@@ -147,7 +147,7 @@ def test_keypoints_on_what_is_behind_the_hand_do_not_count(towel):
 
 
 def test_what_detected_keypoints_measure_is_kept_with_the_masks(tmp_path, monkeypatch):
-    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=4)
+    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=2)
     stored = {view.name: np.array(view.keypoint) for view in sequence.views}
     for view in sequence.views:
         (view.folder / "keypoint.npy").unlink()
