@@ -43,6 +43,7 @@ def _checked_at_times(jaxtyped):
 
     What checks them is made at the first call, since most functions are called by few tests. It is
     one wrapper of beartype, which sees arguments and result; jaxtyping by itself makes two.
+    Functions that state no shapes are left as they are.
     """
     wrong = beartype.BeartypeConf(violation_type=jaxtyping.TypeCheckError)
     calls_of = {}
@@ -60,6 +61,8 @@ def _checked_at_times(jaxtyped):
         return limited(function, CHECKED_EVERY)
 
     def limited(function, every):
+        if not any("jaxtyping." in repr(stated) for stated in function.__annotations__.values()):
+            return function
         checked = functools.cache(
             lambda: jaxtyped(beartype.beartype(function, conf=wrong), typechecker=None)
         )
