@@ -39,6 +39,24 @@ _SENT = "() => new Promise((done) => setTimeout(done, 60))"
 """viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
 _PICTURE = "() => new Promise((done) => setTimeout(() => done(window.drawPicture())))"
 """A picture of all that had begun before: what a page does of its own accord comes in turn."""
+_VALUES = """(body, name) => {
+  const isNamed = (label) => label.textContent.trim().replace(/^● /, "") === name;
+  const rows = [...body.querySelectorAll("label")].filter(isNamed)
+    .map((label) => label.closest("div.mantine-Flex-root"));
+  const isSeen = (field) => field.getBoundingClientRect().width > 0
+    && getComputedStyle(field).visibility === "visible";
+  return rows.flatMap((row) => {
+    const fields = [...(row?.querySelectorAll("input.mantine-NumberInput-input") ?? [])];
+    const marks = [...(row?.querySelectorAll(".mantine-Slider-markLabel") ?? [])];
+    const isFactor = marks.some((mark) => mark.textContent.includes("×"));
+    return isFactor && fields.length < 2 ? [] : fields.filter(isSeen).map((field) => field.value);
+  });
+}"""
+"""What the fields of `ScenePage.field` hold, asked for at once: each of its steps is a question to
+the browser, and tests that wait for a value ask for it time and again."""
+_REST_MS = 250
+"""How long the processor is left to the scene between two looks at it, which cost as much as it
+takes to draw a picture."""
 _SESSION = "document.getElementById('scene').contentWindow.location.pathname.split('/').at(-2)"
 
 
@@ -138,7 +156,9 @@ class ScenePage:
         self.page.mouse.up()
 
     def value(self, label: str) -> float:
-        return float(self.field(label).input_value().removeprefix("×"))
+        shown = self.panel.locator("body").evaluate(_VALUES, label)
+        text = shown[0] if len(shown) == 1 else self.field(label).input_value()  # Waits for it.
+        return float(text.removeprefix("×"))
 
     def set(self, label: str, value: float) -> None:
         """Put a value into the field beside a slider at once, as pasting does."""
@@ -199,7 +219,7 @@ class ScenePage:
     def go(self, frame: int) -> None:
         """Go to a frame, and wait until the server has done so."""
         self.set("Frame", frame)
-        self.until(lambda: self.value("Frame") == self.frame() == frame, f"frame {frame}")
+        self.until(lambda: self.frame() == frame == self.value("Frame"), f"frame {frame}")
 
     def tab(self, name: str) -> None:
         """Open a tab of the panel."""
@@ -270,7 +290,7 @@ class ScenePage:
             assert time.monotonic() < end, (
                 f"{what} did not come true; the panel says\n{self.text()}"
             )
-            self.page.wait_for_timeout(100)
+            self.page.wait_for_timeout(_REST_MS)
 
 
 def object_springs(node: np.ndarray, radius: float, most: int) -> set[tuple[int, int]]:
