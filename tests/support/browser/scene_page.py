@@ -32,9 +32,15 @@ FEWER_PICTURES = """{
 Software draws them, which is much of what these tests cost. A page that is resting draws none, and
 `drawPicture` draws one at once, for whoever would wait for it.
 `physhandi benchmark viewer` measures how many pictures a browser gets."""
-LESS_WORK = ("--disable-gpu-compositing", "--webgl-msaa-sample-count=0", "--js-flags=--no-opt")
-"""Flags of Chromium: without a graphics card draw each picture once, and smooth none. And optimise
-no scripts, for which no page of a test lives long enough."""
+LESS_WORK = (
+    "--disable-gpu-compositing",
+    "--webgl-msaa-sample-count=0",
+    "--js-flags=--no-opt",
+    "--renderer-process-limit=1",
+)
+"""Flags of Chromium: without a graphics card draw each picture once, and smooth none. Optimise no
+scripts, for which no page of a test lives long enough. And start no process beforehand for a next
+page, which most browsers of a test never open."""
 _SENT = "() => new Promise((done) => setTimeout(done, 60))"
 """viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
 _PICTURE = "() => new Promise((done) => setTimeout(() => done(window.drawPicture())))"
