@@ -6,7 +6,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
-from typing import Any, Protocol, get_type_hints
+from typing import Any, Protocol, cast, get_type_hints
 
 import rich
 import viser
@@ -30,7 +30,7 @@ underside (1, 23, 29) was seen, and (0, 80, 94) is with this."""
 
 # Viser looks up for every handle what types the properties of its class have, though these stay:
 # a quarter of the time in which a scene is opened.
-handles.get_type_hints = functools.cache(get_type_hints)
+handles.get_type_hints = cast("Any", functools.cache(get_type_hints))
 
 
 class _LoopEvent(asyncio.Event):
