@@ -9,6 +9,7 @@ import pytest
 import yaml
 from playwright.sync_api import expect
 from support.browser.accessibility import COLOR_RULES, violations
+from support.waiting import until
 
 from physhandi.run import Run
 
@@ -133,9 +134,11 @@ def test_no_tab_keeps_anybody_out(shared_scene):
     for scheme, rules in (("dark", ()), ("light", COLOR_RULES)):
         page.emulate_media(color_scheme=scheme)
         frame.locator(f"html[data-mantine-color-scheme={scheme}]").wait_for(state="attached")
+        scene.rest(on=True)  # Each tab has one picture drawn; nobody looks at others.
         for tab in ("Physics", "Look", "Play", "Edit", "Export"):
             scene.tab(tab)
             assert violations(frame, *rules) == [], f"{tab}, {scheme}"
+        scene.rest(on=False)
     page.emulate_media(color_scheme="null")
 
 
@@ -256,7 +259,10 @@ def test_a_change_is_kept_as_preset_and_run(shared_scene, served, tmp_path):
     scene.tab("Export")
     scene.write("name", "Soft <b>towel")
     scene.press("Run")
-    scene.until(lambda: scene.has("Saved as run"), "a published run", seconds=240)
+    scene.rest(on=True)  # Simulating and measuring takes longer than all else here.
+    until(lambda: any((served.data_dir / "runs").glob("*/current")), scene.text)
+    scene.rest(on=False)
+    scene.until(lambda: scene.has("Saved as run"), "a published run")
     scene.write("name", "Soft towel")
     scene.press("Preset")
     scene.until(lambda: scene.has("Delete preset “Soft towel”"), "a preset")
