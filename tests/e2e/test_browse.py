@@ -22,6 +22,17 @@ BUNDLED = Path(__file__).parents[2] / "sequences"
 NAMES = ("Soft towel", "Stiff towel")
 ROWS = "#runs tbody .name strong"
 _SCENE = re.compile("/viewer/")
+_NO_MORE_ROWS = """() => {
+  const counts = {};
+  for (const row of document.querySelectorAll("main tbody tr")) {
+    const look = row.closest("table").className
+      + row.outerHTML.replace(/>[^<]+<|(data-about|title)="[^"]*"/g, "");
+    counts[look] = (counts[look] ?? 0) + 1;
+    if (counts[look] > 2) row.remove();
+  }
+}"""
+"""Leave two of all rows of a table that differ in nothing but their texts and hints: stripes
+alternate. Looking at colors takes its time for every cell."""
 RUN_COUNT = len(NAMES) + len(list(BUNDLED.glob("runs/*/run.yaml")))
 
 
@@ -166,6 +177,7 @@ def test_no_page_keeps_anybody_out(home: Page, base: str) -> None:
             home.route(_SCENE, lambda route: route.fulfill(content_type="text/html"))
         home.emulate_media(color_scheme="light")
         home.goto(f"{base}{path}")
+        home.evaluate(_NO_MORE_ROWS)
         assert violations(home) == [], path
         home.emulate_media(color_scheme="dark")
         assert violations(home, *COLOR_RULES) == [], f"{path} in the dark"
