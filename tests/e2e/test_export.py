@@ -134,7 +134,7 @@ def test_a_replay_plays_without_a_session_and_from_one_file(
     home.goto(f"{base}/runs/towel_fold_quick")
     home.get_by_role("button", name="Share").click()
     address = home.locator("#shares a").get_attribute("href")
-    window = {"width": 800, "height": 500}  # Whose pixels are all drawn, unlike a scene's.
+    window = {"width": 560, "height": 350}  # Whose pixels are all drawn, unlike a scene's.
     stranger = browser.new_context(viewport=window, reduced_motion="reduce").new_page()
     stranger.set_default_timeout(TIMEOUT_MS)
     stranger.add_init_script(FEWER_PICTURES)

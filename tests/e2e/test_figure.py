@@ -79,6 +79,7 @@ def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage) -> None:
     shown = *scene.springs(), difference
 
     second = scene.page.context.new_page()
+    second.set_viewport_size({"width": 800, "height": 500})  # All of whose pixels are drawn.
     second.goto(address)
     copied = ScenePage(second)
     copied.until(lambda: copied.rollout() == shown, "the same rollout")
