@@ -56,9 +56,13 @@ CHANGING = {
 }
 """What pages offer to those alone who may change things; others offer everybody the same."""
 _BUTTONS = "button, summary, [data-share-view]"
-_OFFERED = """(buttons) => [...document.querySelectorAll(buttons)]
-  .filter((button) => !button.disabled && !button.closest(".charts"))
-  .map((button) => button.getAttribute("aria-label") ?? button.textContent.trim())"""
+_OFFERED = """([buttons, page]) => {
+  const shown = page === null ? document : new DOMParser().parseFromString(page, "text/html");
+  return [...shown.querySelectorAll(buttons)]
+    .filter((button) => !button.disabled && !button.closest(".charts"))
+    .map((button) => button.getAttribute("aria-label") ?? button.textContent.trim());
+}"""
+"""What buttons say in a page that the server sent or, if that is null, in the one that is open."""
 _PRESS_ALL = """(names) => {
   const buttons = [...document.querySelectorAll(names)]
     .filter((button) => !button.disabled && !button.closest("form[method=get], [data-open]"));
@@ -108,24 +112,30 @@ def reader(browser: Browser, served: Any, shown: None) -> Iterator[Page]:
     assert changes == []
 
 
+def offered(page: Page, sent: str | None = None) -> set[str]:
+    """Read the buttons that may be pressed in a page, or in what the server sent in its place."""
+    return set(page.evaluate(_OFFERED, [f"{_BUTTONS}, [role=button]", sent]))
+
+
 def test_what_only_some_may_do_is_offered_to_them_alone(
     home: Page, reader: Page, served: Any
 ) -> None:
     pressed = 0
     for path in PAGES:
-        offers: list[set[str]] = []
+        reader.unroute_all()
+        if path in WITH_SCENES:
+            reader.route(_EMPTY_SCENE, lambda route: route.fulfill(content_type="text/html"))
+        reader.goto(f"{served.base}{path}")
+        expect(reader.locator("[data-only-looks]")).to_have_count(1)
         # Where both are offered the same, what is pressed below tells.
-        for page in (home, reader) if path in CHANGING else (reader,):
-            page.unroute_all()
-            if path in WITH_SCENES:
-                page.route(_EMPTY_SCENE, lambda route: route.fulfill(content_type="text/html"))
-            page.goto(f"{served.base}{path}")
-            offers.append(set(page.evaluate(_OFFERED, f"{_BUTTONS}, [role=button]")))
-            expect(page.locator("[data-only-looks]")).to_have_count(int(page is reader))
         if path in CHANGING:
-            of_all, of_reader = offers
+            addresses = {home: f"{served.base}{path}", reader: reader.url}
+            sent = [page.request.get(address).text() for page, address in addresses.items()]
+            assert ["data-only-looks" in page for page in sent] == [False, True]
+            of_all, of_reader = (offered(reader, page) for page in sent)
             assert of_all - of_reader == CHANGING[path], path
             assert of_reader <= of_all, path
+            assert not CHANGING[path] & offered(reader), path  # No script adds one.
         reader.keyboard.press("n")  # Launches where that may be done.
         pressed += reader.evaluate(_PRESS_ALL, _BUTTONS)
         expect(reader.locator("#new")).to_have_count(0)
