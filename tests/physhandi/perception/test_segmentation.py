@@ -40,20 +40,19 @@ def disc(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def held_disc(tmp_path_factory):
-    return write_disc(tmp_path_factory.mktemp("segment") / "held", hand=True)
+    return write_disc(tmp_path_factory.mktemp("segment") / "held", hand=True, frames=5)
 
 
 def test_one_click_finds_the_object_in_all_frames_of_all_views(disc):
     sequence, true = disc
     # From the middle it is followed both ways.
-    found, again = (segment(sequence, [Click(*disc_click("top", 4))]) for _ in range(2))
+    found = segment(sequence, [Click(*disc_click("top", 4))])
     assert set(found) == {"top", "side"}
     for view, label in found.items():
         assert label.shape == (FRAMES, HEIGHT, WIDTH)
         assert label.dtype == np.uint8
         assert set(np.unique(label)) == {0, 1}
         assert agreement(label, true[view], 1).min() > 0.93
-        np.testing.assert_array_equal(again[view], label)
 
 
 def test_clicks_in_two_frames_and_views_agree_with_the_truth(disc):
@@ -75,7 +74,7 @@ def test_hands_are_found_from_keypoints_and_are_never_the_object(held_disc):
 
 
 def test_the_object_is_not_the_fingers_behind_it(tmp_path):
-    sequence, true = write_disc(tmp_path / "over", hand=True, top=ABOVE_HAND)
+    sequence, true = write_disc(tmp_path / "over", hand=True, top=ABOVE_HAND, frames=5)
     found = segment(sequence, [Click(*disc_click(top=ABOVE_HAND))])
     for view, label in found.items():
         assert ((label > 1) & (true[view] == 1)).sum() < 0.02 * (true[view] == 1).sum()
@@ -93,12 +92,12 @@ def test_a_hand_that_one_view_does_not_detect_is_shown_to_it_by_the_other(tmp_pa
 
 @pytest.mark.parametrize("unsure", ["side", "top"])
 def test_what_one_view_takes_for_a_hand_yields_to_a_view_that_is_surer(tmp_path, unsure):
-    sequence, true = write_disc(tmp_path / "held", hand=True, frames=6)
+    sequence, true = write_disc(tmp_path / "held", hand=True, frames=4)
     path = sequence.folder / "views" / unsure / "keypoint.npy"
     keypoint = np.load(path)
     # On the table, 0.1 m and more from the hand; surer than the other view, but in few frames.
     keypoint[:, :, :, 0] -= 55
-    keypoint[2:, :, :, 2], keypoint[:2, :, :, 2] = 0.5, 1.0
+    keypoint[1:, :, :, 2], keypoint[:1, :, :, 2] = 0.5, 1.0
     np.save(path, keypoint)
     other = ({"side", "top"} - {unsure}).pop()
     right = np.load(sequence.folder / "views" / other / "keypoint.npy")
@@ -195,8 +194,9 @@ def test_a_rope_is_as_thin_beside_a_hand_as_elsewhere(tmp_path, monkeypatch):
 
 def test_a_knot_beside_a_hand_stays_the_ropes_by_its_colors(tmp_path):
     sequence, true = write_fist_on_a_rope(tmp_path / "knot", knot=True)
-    found = segment(sequence, [Click("top", 0, 30, 53)])["top"]
+    found, again = (segment(sequence, [Click("top", 0, 30, 53)])["top"] for _ in range(2))
     assert agreement(found, true, 1).min() > 0.8
+    np.testing.assert_array_equal(again, found)
 
 
 @pytest.mark.parametrize("width", [2, 3, 5, 8])
