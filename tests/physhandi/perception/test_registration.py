@@ -77,7 +77,7 @@ def test_what_is_hidden_follows_its_surroundings() -> None:
 
 
 def test_no_node_is_bent_below_the_ground() -> None:
-    cloud = seen(np.asarray, noise=0.003) + np.array([0.0, 0.0, 0.3])
-    start = sheet(SPACING) + np.array([0.0, 0.0, 0.29])
+    cloud = seen(np.asarray, noise=0.003, count=400) + np.array([0.0, 0.0, 0.3])
+    start = sheet(2 * SPACING) + np.array([0.0, 0.0, 0.29])
     assert bend_object(start, cloud)[:, 2].min() < 0.2995
     assert bend_object(start, cloud, 0.3)[:, 2].min() == pytest.approx(0.3, abs=1e-6)
