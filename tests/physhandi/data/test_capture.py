@@ -640,8 +640,7 @@ def test_a_sequence_that_is_there_is_taken_only_if_its_calibration_is_the_same(t
 
 
 def test_a_sequence_that_is_there_is_taken_only_if_the_board_was_the_same(tmp_path):
-    cameras = {name: camera_at(at, scale=4) for name, at in (("left", 30), ("right", 110))}
-    raw = RawCapture(tmp_path / "raw", cameras).write(2, poses=False)
+    raw = RawCapture(tmp_path / "raw", {"left": camera_at(30, scale=4)}).write(2, poses=False)
     raw.photograph_board()
     board = raw.folder / "calibration/board.json"
     photograph = raw.folder / "calibration/left/00000.png"

@@ -158,9 +158,10 @@ def test_cameras_find_each_other_by_a_printed_table(tmp_path: Path) -> None:
     # The table of this recording is checkered, which fits in many ways or none.
     with pytest.raises(ImportFailedError, match="let all cameras see more of a table with a"):
         import_capture(raw.folder, tmp_path / "none", options=BY_TABLE)
+    sheet = printed(0)
     for name, camera in cameras.items():
         for frame in range(2):
-            image = photograph(camera, printed(0), frame)
+            image = photograph(camera, sheet, frame)
             cv2.imwrite(str(raw.folder / name / f"color/{frame:05d}.png"), image[..., ::-1])
     both = CaptureOptions(by_table=True, board=CharucoTarget(7, 5, 0.04))
     with pytest.raises(UsageError, match="needs no board"):
