@@ -26,8 +26,26 @@ def content(folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.fixture(scope="module")
+def annotated_held(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A disc under a hand with masks and tracks that were made here, to copy."""
+    sequence, _ = write_disc(tmp_path_factory.mktemp("held") / "disc", hand=True, frames=3)
+    return annotate(sequence.folder, [Click(*disc_click())]).folder
+
+
+@pytest.fixture(scope="module")
+def annotated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same of a disc alone."""
+    sequence, _ = write_disc(tmp_path_factory.mktemp("alone") / "disc", frames=4)
+    return annotate(sequence.folder, [Click(*disc_click())]).folder
+
+
+def copied(folder: Path, place: Path) -> Sequence:
+    return Sequence.load(Path(shutil.copytree(folder, place / folder.name)))
+
+
 def test_one_click_makes_a_sequence_whose_object_can_be_observed(tmp_path):
-    sequence, true = write_disc(tmp_path / "disc", hand=True, frames=5)
+    sequence, true = write_disc(tmp_path / "disc", hand=True, frames=3)
     assert sequence.missing("object") == ["mask"]
     view, frame, x, y = disc_click()
     before = content(sequence.folder)
@@ -41,7 +59,7 @@ def test_one_click_makes_a_sequence_whose_object_can_be_observed(tmp_path):
     }
     assert done.provenance["masks"] == done.provenance["tracks"] == about
     for one in done.views:
-        both = [(one.mask(f) == 1) & (true[one.name][f] == 1) for f in range(5)]
+        both = [(one.mask(f) == 1) & (true[one.name][f] == 1) for f in range(3)]
         assert np.sum(both) > 0.85 * (true[one.name] == 1).sum()
     cloud = np.concatenate(observe_object(done).cloud)
     assert abs(np.median(cloud[:, 2]) - 0.03) < 0.003
@@ -51,10 +69,12 @@ def test_one_click_makes_a_sequence_whose_object_can_be_observed(tmp_path):
     assert not [name for name in after if ".tmp" in name]
 
 
-def test_masks_that_were_made_here_are_replaced_and_tracks_go_with_their_object(tmp_path):
-    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=3)
-    annotate(sequence.folder, [Click(*disc_click())])
-    done = annotate(sequence.folder, [])
+def test_masks_that_were_made_here_are_replaced_and_tracks_go_with_their_object(
+    tmp_path, annotated_held
+):
+    before = copied(annotated_held, tmp_path)
+    assert all(view.track is not None for view in before.views)
+    done = annotate(before.folder, [])
     done.validate()
     assert done.provenance["masks"]["clicks"] == []
     assert "tracks" not in done.provenance
@@ -63,7 +83,7 @@ def test_masks_that_were_made_here_are_replaced_and_tracks_go_with_their_object(
 
 
 def test_given_masks_are_only_replaced_when_that_is_asked_for(tmp_path):
-    sequence, _ = write_disc(tmp_path / "disc", masks=True, frames=3)
+    sequence, _ = write_disc(tmp_path / "disc", masks=True, frames=2)
     before = content(sequence.folder)
     with pytest.raises(UsageError, match="has masks that were not made here"):
         annotate(sequence.folder, [Click(*disc_click())])
@@ -78,7 +98,7 @@ def test_a_cancelled_or_refused_annotation_leaves_what_was_there(tmp_path):
             if stage == "point_tracking":
                 raise CancelledError("enough")
 
-    sequence, _ = write_disc(tmp_path / "disc", frames=3)
+    sequence, _ = write_disc(tmp_path / "disc", frames=2)
     before = content(sequence.folder)
     with pytest.raises(CancelledError):
         annotate(sequence.folder, [Click(*disc_click())], UntilTracking())
@@ -129,9 +149,8 @@ def test_a_corrected_mask_stands_alone_or_is_carried_on_until_the_next_one(tmp_p
     assert again.provenance["masks"]["corrections"][1]["carried_on"] is False
 
 
-def test_tracks_that_were_made_here_follow_the_corrected_mask(tmp_path):
-    sequence, _ = write_disc(tmp_path / "disc", frames=6)
-    done = annotate(sequence.folder, [Click(*disc_click())])
+def test_tracks_that_were_made_here_follow_the_corrected_mask(tmp_path, annotated):
+    done = sequence = copied(annotated, tmp_path)
     side = np.load(sequence.folder / "views/side/track.npy")
     nothing = np.zeros_like(labels(done)[3])
     done = correct_masks(sequence.folder, [Correction("top", 3, nothing)])
@@ -144,17 +163,18 @@ def test_tracks_that_were_made_here_follow_the_corrected_mask(tmp_path):
     assert done.provenance["masks"]["clicks"] == done.provenance["tracks"]["clicks"]
     with pytest.raises(UsageError, match="no masks that could be corrected"):
         correct_masks(sequence.folder, [Correction("left", 0, nothing)])
-    with pytest.raises(UsageError, match="no frame 6"):
-        correct_masks(sequence.folder, [Correction("top", 6, nothing)])
+    with pytest.raises(UsageError, match="no frame 4"):
+        correct_masks(sequence.folder, [Correction("top", 4, nothing)])
     with pytest.raises(UsageError, match=r"labels \[0, 1\], not 120x96 px of \[2\]"):
         correct_masks(sequence.folder, [Correction("top", 0, nothing + 2)])
     with pytest.raises(UsageError, match="not 119x96 px"):
         correct_masks(sequence.folder, [Correction("top", 0, nothing[:, 1:])])
 
 
-def test_tracks_of_the_users_model_are_hidden_where_a_correction_shows_no_object(tmp_path):
-    sequence, _ = write_disc(tmp_path / "disc", frames=4)
-    done = annotate(sequence.folder, [Click(*disc_click())])
+def test_tracks_of_the_users_model_are_hidden_where_a_correction_shows_no_object(
+    tmp_path, annotated
+):
+    done = sequence = copied(annotated, tmp_path)
     path = sequence.folder / "sequence.yaml"
     head, tracks = path.read_text().split("  tracks:\n")
     tracks = tracks.replace("source: built-in", "source: tapnext\n    model_sha256: abc")
@@ -200,11 +220,12 @@ def whole_test() -> Iterator[pytest.MonkeyPatch]:
 
 @pytest.mark.parametrize("clicks", [[Click(*disc_click())], []], ids=["first time", "hands alone"])
 def test_masks_and_tracks_can_be_made_again_wherever_their_storing_ended(
-    tmp_path, monkeypatch, whole_test, clicks
+    tmp_path, monkeypatch, whole_test, annotated_held, clicks
 ):
-    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=3)
-    if not clicks:  # Tracks are there that are to go.
-        annotate(sequence.folder, [Click(*disc_click())])
+    if clicks:
+        sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=3)
+    else:  # Tracks are there that are to go.
+        sequence = copied(annotated_held, tmp_path)
     stored = iter(range(100))
     moves = Path.rename
 
@@ -243,9 +264,11 @@ def test_masks_and_tracks_can_be_made_again_wherever_their_storing_ended(
     assert ends >= 6
 
 
-def test_masks_whose_correction_ended_midway_are_not_made_again_unasked(tmp_path, monkeypatch):
-    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=3)
-    folder = annotate(sequence.folder, [Click(*disc_click())]).folder
+def test_masks_whose_correction_ended_midway_are_not_made_again_unasked(
+    tmp_path, monkeypatch, annotated_held
+):
+    sequence = copied(annotated_held, tmp_path)
+    folder = sequence.folder
     meta = folder / "sequence.yaml"
     meta.write_text(meta.read_text().replace("source: built-in", "source: by hand"))
     view = sequence.views[0].name
