@@ -1,6 +1,7 @@
 """Cells: what they are scored on, when they are computed anew, and what is told of them."""
 
 import ast
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -184,11 +185,19 @@ def test_a_look_is_fitted_once_for_all_methods_unless_the_order_leaves_it_out(
 # What a cell is found again by
 
 
+def statements(block: ast.AST) -> Iterator[ast.AST]:
+    """Walk statements without the expressions in them, which are most of a file."""
+    yield block
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for inner in getattr(block, part, ()):
+            yield from statements(inner)
+
+
 @cache
 def imported_by(file: str) -> tuple[str, ...]:
     """Files of the library that one of it imports."""
     names: list[str] = []
-    for node in ast.walk(ast.parse((LIBRARY / file).read_text())):
+    for node in statements(ast.parse((LIBRARY / file).read_text())):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module is not None:

@@ -155,11 +155,11 @@ def test_hands_are_told_where_they_gave_way_to_what_they_hold(held):
     assert held.hands["right"][33, :, 2, 3].min() > 0.09
 
 
-def test_the_same_input_gives_the_same_bits():
-    first, again = (lift(frame_count=14) for _ in range(2))
-    assert first.position.tobytes() == again.position.tobytes()
-    assert first.contact.tobytes() == again.contact.tobytes()
-    assert np.ptp(first.position, axis=0).max() > 1e-4
+def test_the_same_input_gives_the_same_bits(held):
+    again = lift(frame_count=14)
+    assert held.position[:14].tobytes() == again.position.tobytes()
+    assert held.contact[:14].tobytes() == again.contact.tobytes()
+    assert np.ptp(again.position, axis=0).max() > 1e-4
 
 
 def test_a_stiffer_core_gives_way_less():
