@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
+from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
@@ -48,7 +49,7 @@ def _look_for_no_garbage() -> Iterator[None]:
     gc.disable()
     yield
     tree.cache_clear()
-    all_nodes.cache_clear()
+    by_kind.cache_clear()
     gc.enable()
 
 
@@ -58,9 +59,25 @@ def tree(path: Path) -> ast.Module:
 
 
 @cache
-def all_nodes(path: Path) -> tuple[ast.AST, ...]:
-    """Walk a module once; that takes longer than parsing it."""
-    return tuple(ast.walk(tree(path)))
+def by_kind(path: Path) -> dict[type[ast.AST], list[ast.AST]]:
+    """Sort all nodes of a module by their kind, but not what says that one is read or written.
+
+    Modules are walked once, since that takes as long as parsing them; a kind is asked for often.
+    """
+    found: list[ast.AST] = [tree(path)]
+    kinds = defaultdict(list)
+    for node in found:
+        kinds[type(node)].append(node)
+        for value in vars(node).values():
+            if isinstance(value, list):
+                found += [one for one in value if isinstance(one, ast.AST)]
+            elif isinstance(value, ast.AST) and not isinstance(value, ast.expr_context):
+                found.append(value)
+    return kinds
+
+
+def nodes_of(path: Path, *kinds: type[ast.AST]) -> Iterator[ast.AST]:
+    return chain.from_iterable(by_kind(path).get(kind, ()) for kind in kinds)
 
 
 def place(path: Path, node: ast.AST | None = None) -> str:
@@ -70,9 +87,9 @@ def place(path: Path, node: ast.AST | None = None) -> str:
 
 def nodes(files: Iterable[Path], kind: type[Node]) -> Iterator[tuple[Path, Node]]:
     for path in files:
-        for node in all_nodes(path):
-            if isinstance(node, kind):
-                yield path, node
+        for node in nodes_of(path, kind):
+            assert isinstance(node, kind)
+            yield path, node
 
 
 def module_name(path: Path) -> str:
@@ -146,8 +163,7 @@ def test_kernels_write_only_to_outputs() -> None:
 
 def spoken(path: Path) -> Iterator[ast.AST]:
     """Where a module writes to standard output or standard error, whatever the way."""
-    kinds = ast.Call | ast.Attribute | ast.ImportFrom
-    for node in (node for node in all_nodes(path) if isinstance(node, kinds)):
+    for node in nodes_of(path, ast.Call, ast.Attribute, ast.ImportFrom):
         match node:
             case ast.Call(func=ast.Name("print" | "input")):
                 yield node
@@ -211,7 +227,8 @@ def imported_modules(path: Path) -> set[str]:
     What a package's `__init__` imports inside functions is left out: these are doors to what
     stands above, opened for whoever calls them.
     """
-    top = tree(path).body if path.name == "__init__.py" else all_nodes(path)
+    is_door = path.name == "__init__.py"
+    top = tree(path).body if is_door else nodes_of(path, ast.Import, ast.ImportFrom)
     found: set[str] = set()
     for node in top:
         if isinstance(node, ast.Import):
@@ -280,13 +297,17 @@ def test_a_public_name_has_one_meaning() -> None:
 
 def named_values(path: Path) -> Iterator[tuple[ast.AST, str]]:
     """Variables, parameters and attributes, each where it gets a value or is declared."""
-    for node in all_nodes(path):
-        if isinstance(node, ast.arg):
-            yield node, node.arg
-        elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
-            yield node, node.id if isinstance(node, ast.Name) else node.attr
-        elif isinstance(node, ast.ExceptHandler | ast.MatchAs | ast.MatchStar) and node.name:
-            yield node, node.name
+    kinds = ast.arg, ast.Name, ast.Attribute, ast.ExceptHandler, ast.MatchAs, ast.MatchStar
+    for node in nodes_of(path, *kinds):
+        match node:
+            case ast.arg(arg=name) | ast.Name(id=name, ctx=ast.Store()):
+                yield node, name
+            case ast.Attribute(attr=name, ctx=ast.Store()):
+                yield node, name
+            case ast.ExceptHandler(name=str(name)) | ast.MatchAs(name=str(name)):
+                yield node, name
+            case ast.MatchStar(name=str(name)):
+                yield node, name
 
 
 def test_a_value_is_named_after_what_it_is() -> None:
