@@ -11,7 +11,7 @@ def helix(count: int) -> np.ndarray:
 
 def test_a_centre_line_is_as_long_as_the_thing_whatever_the_noise():
     random = np.random.default_rng(0)
-    axis = helix(4000)
+    axis = helix(2000)
     true = float(np.linalg.norm(np.diff(axis, axis=0), axis=1).sum())
     for noise in (0.0, 0.001, 0.003):
         around = random.normal(size=axis.shape)
