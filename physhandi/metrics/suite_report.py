@@ -8,11 +8,12 @@ import io
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 SUITE_COLUMNS = ("method", "split", "metric", "mean", "low", "high", "n")
@@ -568,7 +569,9 @@ def is_higher_better(metric: str) -> bool:
 
 
 def interval(value: Float[ndarray, " case"], resamples: int = RESAMPLES) -> tuple[float, float]:
-    """Compute the percentile interval of the mean over cases."""
+    """Compute the percentile interval of the mean over cases; of one case it is that alone."""
+    if len(value) == 1:
+        return float(value[0]), float(value[0])
     tail = (1.0 - LEVEL) / 2.0
     low, high = np.quantile(resampled_means(value, resamples), (tail, 1.0 - tail))
     return float(low), float(high)
@@ -587,10 +590,15 @@ def resampled_means(
     """
     if len(value) == 0:
         raise ValueError("there is no case to resample")
-    draw = np.random.default_rng([_SEED, len(value)]).integers(
-        len(value), size=(resamples, len(value))
-    )
-    return value[draw].mean(axis=1)
+    return value[_draw(len(value), resamples)].mean(axis=1)
+
+
+@cache
+def _draw(count: int, resamples: int) -> Int[ndarray, "resample case"]:
+    """Draw cases; every row of a table asks for the same."""
+    draw = np.random.default_rng([_SEED, count]).integers(count, size=(resamples, count))
+    draw.flags.writeable = False
+    return draw
 
 
 def _grouped(scores: Iterable[Score]) -> dict[tuple[str, str, str], dict[str, float]]:
