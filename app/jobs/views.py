@@ -474,11 +474,17 @@ def _mean(weighted: list[tuple[float, float]]) -> float | None:
     return sum(error * weight for error, weight in weighted) / total if total else None
 
 
-def describe_results(run: Run) -> dict[str, dict[str, Any]]:
-    """Collect what a run has found so far: losses, metrics, parameters and environment."""
+def describe_results(run: Run, *names: str) -> dict[str, dict[str, Any]]:
+    """Collect what a run has found so far.
+
+    Args:
+        run: The run.
+        names: Some of losses, metrics, parameters and environment; by default all.
+    """
     results: dict[str, dict[str, Any]] = {}
     problems: list[str] = []
-    for name, (rel, kind) in _SHOWN.items():
+    for name in names or _SHOWN:
+        rel, kind = _SHOWN[name]
         try:
             if run.has(rel):
                 content = run.yaml(rel) if rel.endswith(".yaml") else run.json(rel)
@@ -497,7 +503,7 @@ def read_frame_errors(run: Run) -> dict[str, dict[str, Any]]:
         For each sequence what its ``frame_errors.json`` holds (``unit frames`` and by method
         ``track_error chamfer_l2``) and ``future_start``, the first frame that was not fitted.
     """
-    metrics = describe_results(run).get("metrics", {})
+    metrics = describe_results(run, "metrics").get("metrics", {})
     errors_of: dict[str, dict[str, Any]] = {}
     for name in run.sequence_names:
         rel = SequenceFiles(name).frame_errors
@@ -531,7 +537,7 @@ def loss_curves(run: Run) -> tuple[dict[str, dict[str, Any]], int]:
         while curve and iteration <= curve[-1][0]:
             curve.pop()  # It was started again, or goes on from an earlier checkpoint.
         curve.append([iteration, float(loss)])
-    stages = describe_results(run).get("losses", {})
+    stages = describe_results(run, "losses").get("losses", {})
     result: dict[str, dict[str, Any]] = {}
     for stage in dict.fromkeys([*stages, *curves]):
         summary = named_fields(stages.get(stage)) or {}
