@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 from support.inputs.sheet_sequence import FITTED, FRAMES, NODE
 from support.server.server_world import World
 
+from app.exports.request import FileRequest
 from physhandi.fitting.config import STAGES
 from physhandi.run import Run
 
@@ -167,7 +168,7 @@ def test_the_bundled_run_stays_as_it_is(client: TestClient) -> None:
     assert client.get(f"/api/v1/runs/{run_id}").json()["state"] == "succeeded"
 
 
-def test_exports_read_back_as_what_the_run_holds(world: World) -> None:
+def test_exports_read_back_as_what_the_run_holds(world: World, made: list[FileRequest]) -> None:
     client = world.script()
     rollout = Run.open(world.settings.run_dir / "fitted").array("sequences/sheet/rollout.npy")
 
@@ -191,6 +192,7 @@ def test_exports_read_back_as_what_the_run_holds(world: World) -> None:
     assert "parameters" in yaml.safe_load(export("yaml"))
     scene = GLTF2.load_from_bytes(export("gltf"))
     assert scene.animations[0].channels
+    assert [order.format for order in made] == ["ply", "gltf"]  # What is small is read at once.
 
 
 @pytest.mark.parametrize(
