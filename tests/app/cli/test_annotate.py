@@ -16,15 +16,15 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, s
 
 
 def test_a_click_on_the_command_line_gives_masks_and_tracks(tmp_path, capsys):
-    sequence, _ = write_disc(tmp_path / "disc", frames=4)
+    sequence, _ = write_disc(tmp_path / "disc", frames=2)
     view, frame, x, y = disc_click()
     place = f"{view},{frame},{x:g},{y:g}"
     code, out, error = call(capsys, "annotate", sequence.folder, "--click", place)
     assert code == 0, error
-    assert "frames with object: 4" in out
+    assert "frames with object: 2" in out
     assert "least tracks in a frame: " in out
-    assert "segmentation 8/8" in error
-    assert "point_tracking 8/8" in error
+    assert "segmentation 4/4" in error
+    assert "point_tracking 4/4" in error
     done = Sequence.load(sequence.folder)
     done.validate()
     assert done.missing("mask", "track") == []
@@ -92,7 +92,7 @@ def test_options_of_networks_that_would_be_ignored_are_refused(tmp_path, capsys)
 
 
 def test_hands_of_an_impossible_size_are_told_at_once(tmp_path, capsys, monkeypatch):
-    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=4)
+    sequence, _ = write_disc(tmp_path / "disc", hand=True, frames=2)
     view, frame, x, y = disc_click()
     command = ("annotate", sequence.folder, "--click", f"{view},{frame},{x:g},{y:g}")
     assert "problems" not in call(capsys, *command)[1]

@@ -58,7 +58,7 @@ def port(world: QueueWorld) -> Iterator[int]:
 def test_a_page_follows_a_run_through_one_stream_without_gap_or_repetition(
     world: QueueWorld, port: int
 ) -> None:
-    cursor = re.search(r'data-since="([^"]+)"', world.client.get("/").text)
+    cursor = re.search(r'data-since="([^"]+)"', world.client.get("/runs").text)
     assert cursor is not None
     run_id = world.launch("wait")
     stream = Stream(port, world.token, f"/api/v1/events?since={cursor[1]}")
