@@ -247,7 +247,6 @@ Python does not notice when that cuts the bytecode of a module off, and nobody c
     {
         "recording that is not there": (("reconstruct", "nowhere", "--out", "out"), "", 2),
         "files that cannot grow": ((*EXPORT, "npz", "--out", "out.npz"), FULL, 1),
-        "data folder that is a file": (("evaluate", "run", "a", "--data-dir", "file"), "", 2),
     }
 )
 def test_a_process_ends_as_it_should(here: Terminal, case: tuple[Any, str, int]) -> None:

@@ -237,8 +237,6 @@ def test_cancelling_ends_the_whole_tree_however_stubborn(
     until(lambda: supervisor_of(run.folder) is None)
     with pytest.raises(RunError, match="nothing to cancel"):
         desk.scheduler.cancel(run_id)
-    follower = desk.launch("publish")
-    desk.until(follower, "succeeded")
 
 
 def test_a_fit_is_cancelled_while_its_program_is_loading(desk: Desk) -> None:
