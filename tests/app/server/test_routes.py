@@ -1,5 +1,6 @@
 """The routes of the API and the pages, with a real queue and made-up live scenes."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -159,14 +160,13 @@ def test_a_failure_is_told_on_top_without_the_insides_of_the_program(world: Queu
     assert "job_worker.py" not in page
 
 
-def test_a_log_that_is_a_link_is_not_followed(world: QueueWorld) -> None:
-    run_id = world.launch("crash")
-    world.until(run_id, "failed")
-    log = world.folder(run_id) / "log.txt"
-    assert "the last words" in world.client.get(f"/runs/{run_id}").text
+def test_a_log_that_is_a_link_is_not_followed(world: QueueWorld, fitted_folder: Path) -> None:
+    log = shutil.copytree(fitted_folder, world.folder("fitted")) / "log.txt"
+    log.write_text("the last words")
+    assert "the last words" in world.client.get("/runs/fitted").text
     log.rename(world.data_dir / "secret")
     log.symlink_to(world.data_dir / "secret")
-    assert "the last words" not in world.client.get(f"/runs/{run_id}").text
+    assert "the last words" not in world.client.get("/runs/fitted").text
 
 
 def test_names_of_users_are_text_everywhere(world: QueueWorld) -> None:
@@ -222,9 +222,11 @@ def test_scenes_are_opened_for_the_browser_that_asks_up_to_the_limit(world: Queu
     assert wrong.status_code == 422
 
 
-def test_the_home_page_stays_short_however_many_runs_there_are(world: QueueWorld) -> None:
-    first = world.launch("wait first")
-    world.until(first, "running")
+def test_the_home_page_stays_short_however_many_runs_there_are(
+    world: QueueWorld, fitted_folder: Path
+) -> None:
+    first = "fitted"
+    shutil.copytree(fitted_folder, world.folder(first))
     for number in range(60):
         folder = world.folder(f"old{number:02d}")
         folder.mkdir()
@@ -232,7 +234,7 @@ def test_the_home_page_stays_short_however_many_runs_there_are(world: QueueWorld
     page = world.client.get("/").text
     rows = '<tr class="plays" data-run='
     assert page.count(rows) == 8
-    assert first in page
+    assert f'href="runs/{first}"' in page
     assert "All 61 runs" in page
     assert world.client.get("/runs").text.count(rows) == 61
     half = world.client.get("/runs?limit=40&offset=40&sort=name").text
