@@ -151,13 +151,19 @@ def test_a_fit_whose_node_is_lost_is_started_again_once_and_published_once(
     progress = Deeds(second=lose)
     lost = "its job on the cluster has ended as FAILED. It was started again (2 of 2)."
     with FollowedRun(run.folder, engine) as followed:
-        while not followed.look():
+
+        def is_over() -> bool:
+            if followed.look():
+                return True
             progress.report(followed.report()["stage"])
             if lost in progress.told[-1]:
                 (tmp_path / "gate").touch()
             if run.attempt == 2:
                 finish(run)
             engine.refresh()
+            return False
+
+        until(is_over)
         followed.check_end()
     run.verify()
     assert [job["metadata"]["start"] for job in cluster.submitted] == ["1", "2"]
@@ -172,10 +178,16 @@ def test_a_fit_that_loses_its_process_twice_has_failed(
 ) -> None:
     run = make("wait")
     with FollowedRun(run.folder, engine) as followed:
-        while not followed.look():
+
+        def is_over() -> bool:
+            if followed.look():
+                return True
             if followed.report()["stage"] == "second":
                 cluster.kill(cluster.submitted[-1]["submission_id"])
             engine.refresh()
+            return False
+
+        until(is_over)
         with pytest.raises(RunError, match=r"ended as FAILED\. That happened twice"):
             followed.check_end()
     assert len(cluster.submitted) == 2
