@@ -34,7 +34,7 @@ from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import NullProgress, Progress
 
 QUICK = HandFitConfig(iterations=100)
-RECORDED = 40
+RECORDED = 32
 """Frames of the real recording that are used."""
 
 
