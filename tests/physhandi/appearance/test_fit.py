@@ -19,7 +19,7 @@ from physhandi.data.view import View
 from physhandi.errors import CancelledError, MissingInputError
 from physhandi.progress import Progress
 
-CONFIG = AppearanceConfig(splat_count=500, iterations=90, renewal_interval=20)
+CONFIG = AppearanceConfig(splat_count=500, iterations=60, renewal_interval=20)
 
 
 def sheet() -> Splats:
@@ -105,7 +105,7 @@ def views() -> list[View]:
 
 @pytest.fixture(scope="module")
 def kept() -> Kept:
-    return Kept(after=47)
+    return Kept(after=31)
 
 
 @pytest.fixture(scope="module")
@@ -134,14 +134,14 @@ def test_a_camera_that_took_no_part_sees_the_object_as_it_is(
     both = covered[0] & covered[1]
     assert np.abs(true.depth - found.depth)[both].mean() < 0.003
     assert len(fitted.splats.center) <= 500
-    assert len(fitted.curve) == 90
-    assert fitted.curve[-9:].mean() < 0.6 * fitted.curve[:9].mean()
+    assert len(fitted.curve) == 60
+    assert fitted.curve[-6:].mean() < 0.6 * fitted.curve[:6].mean()
 
 
 def test_a_resumed_fit_ends_with_the_same_bits(
     views: list[View], fitted: FittedSplats, kept: Kept
 ) -> None:
-    assert len(kept.state["curve"]) == 47
+    assert len(kept.state["curve"]) == 31
     again = fit_splats(views, sheet().rest_node, config=CONFIG, checkpointer=Resumed(kept.state))
     np.testing.assert_array_equal(again.curve, fitted.curve)
     for name, value in fitted.splats.to_tensors().items():
@@ -209,7 +209,7 @@ def test_views_without_the_object_and_cancels_are_told(views: list[View]) -> Non
 
     class Cancelled(Progress):
         def report(self, *report: Any, **more: Any) -> None:
-            assert report[:3] == ("appearance", 1, 90)
+            assert report[:3] == ("appearance", 1, 60)
             self.is_asked = True
 
         def check_cancelled(self) -> None:
