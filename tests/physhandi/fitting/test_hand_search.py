@@ -63,7 +63,7 @@ def test_of_a_palm_and_its_mirror_image_depth_and_fingers_tell_the_true_one(
         pose = mirrored_pose([CAMERA], keypoint[:, frame], model, right.pose(frame))
         rotation[frame], translation[frame] = pose[0].as_quat(), pose[1]
         assert (pose[0] * true[frame].inv()).magnitude() > 0.6
-    depth, config = depth_target(sequence, "right", 128), HandFitConfig(search_iterations=80)
+    depth, config = depth_target(sequence, "right", 128), HandFitConfig(search_iterations=60)
     assert depth is not None
     hand = SearchedHand(
         cameras=[CAMERA],
@@ -76,7 +76,7 @@ def test_of_a_palm_and_its_mirror_image_depth_and_fingers_tell_the_true_one(
     )
     told: list[tuple[int, float]] = []
     found = search_hand(hand, config, lambda number, loss: told.append((number, float(loss))))
-    assert [number for number, _ in told] == list(range(1, 81))
+    assert [number for number, _ in told] == list(range(1, 61))
     assert told[-1][1] < told[0][1]
     # Frames 0, 3 and 6 are searched, and the others lie between them.
     turned = (Rotation.from_quat(found["rotation"].numpy()) * true.inv()).magnitude()
