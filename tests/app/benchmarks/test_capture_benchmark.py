@@ -42,7 +42,7 @@ def test_a_made_scene_is_captured_imported_and_scored(
 
     monkeypatch.setattr(synthesize, "simulate_truth", lifted)
     monkeypatch.setattr(suite, "make_recording", with_two_cameras)
-    order = CaptureOrder(frames=3, image_size="half", resolution="tiny", fit="none")
+    order = CaptureOrder(frames=2, image_size="half", resolution="tiny", fit="none")
     place = ScenePlace(tmp_path, "cloth/lift", order.seed)
     capture.make_scene(place, "cloth/lift", order, NullProgress())
     found = capture.import_scene(place, NullProgress()) | capture.score_import(place)
