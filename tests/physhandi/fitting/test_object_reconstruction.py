@@ -75,10 +75,10 @@ def held_sheet(name: str, lift: float, scale: float = 1.0) -> ObjectProblem:
 
 
 def config(**first_order: Any) -> ObjectFitConfig:
-    settings: dict[str, Any] = {"iterations": 30, "learning_rate": 0.1, "is_annealed": False}
+    settings: dict[str, Any] = {"iterations": 20, "learning_rate": 0.1, "is_annealed": False}
     return ObjectFitConfig(
         search=SearchConfig(
-            generations=4,
+            generations=3,
             population=6,
             variables={"stiffness": SearchVariable(low=50.0, high=2000.0, scale="log")},
         ),
