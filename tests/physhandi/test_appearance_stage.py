@@ -18,7 +18,7 @@ from physhandi.errors import CancelledError, UsageError
 from physhandi.fitting.config import APPEARANCE, EVALUATION, STAGES, PipelineConfig
 from physhandi.run import Run
 
-ITERATIONS = 40
+ITERATIONS = 24
 
 
 def config_of(**changes: Any) -> PipelineConfig:
