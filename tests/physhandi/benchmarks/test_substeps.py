@@ -30,7 +30,7 @@ def bundled():
 def test_the_towel_stays_within_a_millimetre_of_the_reference(device):
     model, parameters, control = bundled()
     result = benchmark_substeps(
-        model, parameters, control[:40], name="towel", device=device, substeps=(300,)
+        model, parameters, control[:36], name="towel", device=device, substeps=(300,)
     )
     assert json.loads(json.dumps(result)) == result
     assert result["motion_m"] > 0.1
