@@ -28,7 +28,7 @@ from app.viewer.sessions import Session, Sessions
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 
-TABS = 5
+TABS = 10
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_two_tabs_stream_what_their_own_sliders_ask_for(many) -> None:
 
 
 @pytest.mark.slow
-def test_five_tabs_simulate_at_once(many) -> None:
+def test_ten_tabs_simulate_at_once(many) -> None:
     with ExitStack() as stack:
         clients = [stack.enter_context(open_tab(many)[1]) for _ in range(TABS)]
         for client in clients:
