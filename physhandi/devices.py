@@ -2,11 +2,13 @@
 
 import ctypes
 import os
+import platform
 import sys
 import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 
 from physhandi.errors import UsageError
 
@@ -107,8 +109,21 @@ def only_card(card: str | None) -> dict[str, str]:
     return {} if card is None else {"CUDA_VISIBLE_DEVICES": card}
 
 
+@cache
+def processor_name() -> str:
+    """Give what the processor calls itself; empty if it does not tell."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
 def describe_device(name: str) -> str:
-    """Give the model of a Warp device, as its driver names it."""
+    """Give the model of a Warp device, as its driver names it; of a CPU, as it calls itself."""
+    if name == "cpu":
+        return processor_name()  # Known without Warp, as above.
     import warp as wp
 
     start_warp()

@@ -22,12 +22,12 @@ import numpy as np
 
 from app.benchmarks.parts import CaptureSize, FitProfile
 from physhandi.child import Channel, Child, run_child
-from physhandi.data.environment import processor_name
 from physhandi.data.files import write_json, write_yaml
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
 from physhandi.data.truth import read_truth
 from physhandi.data.view import View
+from physhandi.devices import processor_name
 from physhandi.errors import CancelledError, PhysHandiError, RunError, UsageError, describe
 from physhandi.progress import PrintedProgress, Progress, ToldProgress
 

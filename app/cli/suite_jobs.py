@@ -185,8 +185,7 @@ def _require_same(request: Mapping[str, Any], device: str) -> dict[str, Any]:
     Raises:
         UsageError: If it is not.
     """
-    # Warp, which knows what a GPU is called, takes longer to load than all else that is done here.
-    own = describe_environment(device, "" if device == "cpu" else describe_device(device))
+    own = describe_environment(device, describe_device(device))
     own |= {"code": code_version((*PREDICTIONS, *SCORES))}
     others = request.get("order", {}).get("environment", {"code": request.get("code", own["code"])})
     for name in _SAME:

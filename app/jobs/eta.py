@@ -13,9 +13,10 @@ from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
 from physhandi.data import sequence as recordings
-from physhandi.data.environment import ENVIRONMENT, processor_name
+from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import named_fields
 from physhandi.data.run_folder import CURRENT, EXIT, moment_of, read_mapping
+from physhandi.devices import processor_name
 from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.fitting.checks.readiness import (
     colored_views,

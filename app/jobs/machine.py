@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 
 from app.jobs.processes import supervisor_of
-from physhandi.data.environment import processor_name
+from physhandi.devices import processor_name
 
 _CARDS_KEPT_S = 2.0
 """Age at which an answer of the tool is renewed [s]."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from physhandi.data.run_folder import now
+from physhandi.devices import processor_name
 
 ENVIRONMENT = "environment.json"
 _PACKAGES = ("physhandi", "warp-lang", "torch", "numpy", "scipy")
@@ -48,17 +49,6 @@ def _installed() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return versions
-
-
-@cache
-def processor_name() -> str:
-    """Give what the processor calls itself; empty if it does not tell."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor())
 
 
 def commit_of(checkout: Path) -> str | None:

@@ -570,8 +570,6 @@ def is_higher_better(metric: str) -> bool:
 
 def interval(value: Float[ndarray, " case"], resamples: int = RESAMPLES) -> tuple[float, float]:
     """Compute the percentile interval of the mean over cases; of one case it is that alone."""
-    if len(value) == 1:
-        return float(value[0]), float(value[0])
     tail = (1.0 - LEVEL) / 2.0
     low, high = np.quantile(resampled_means(value, resamples), (tail, 1.0 - tail))
     return float(low), float(high)

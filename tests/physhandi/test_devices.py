@@ -13,6 +13,7 @@ from physhandi.devices import (
     has_cuda_driver,
     pick_device,
     pick_devices,
+    processor_name,
 )
 from physhandi.errors import UsageError
 
@@ -52,7 +53,7 @@ def test_what_was_written_before_a_failed_start_is_shown() -> None:
 def test_a_device_is_picked_by_name() -> None:
     assert pick_device("auto") == ("cuda:0" if wp.is_cuda_available() else "cpu")
     assert pick_device("cpu") == "cpu"
-    assert describe_device("cpu")
+    assert describe_device("cpu") == processor_name() != ""
     with pytest.raises(UsageError, match="There is no device 'tpu' here"):
         pick_device("tpu")
     assert pick_devices("auto") == (pick_device("auto"),)
@@ -65,7 +66,7 @@ def test_a_device_is_picked_by_name() -> None:
             pick_device("cuda")
 
 
-def test_the_cpu_is_picked_without_warp_where_nothing_else_is() -> None:
+def test_the_cpu_is_picked_and_named_without_warp_where_nothing_else_is() -> None:
     done = run(
         "import sys\n"
         "sys.modules['warp'] = None\n"
@@ -73,9 +74,10 @@ def test_the_cpu_is_picked_without_warp_where_nothing_else_is() -> None:
         "devices.has_cuda_driver = lambda: False\n"
         "print(devices.pick_devices('all'), devices.pick_devices('auto'))\n"
         "devices.has_cuda_driver = lambda: True\n"
-        "print(devices.pick_device('cpu'))\n"
+        "print(devices.pick_device('cpu'), devices.describe_device('cpu'))\n"
     )
-    assert (done.stdout, done.stderr) == ("('cpu',) ('cpu',)\ncpu\n", "")
+    assert done.stdout == f"('cpu',) ('cpu',)\ncpu {processor_name()}\n"
+    assert done.stderr == ""
 
 
 @pytest.mark.gpu

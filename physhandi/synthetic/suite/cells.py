@@ -30,7 +30,6 @@ from physhandi.appearance.scoring import (
 )
 from physhandi.appearance.splats import Splats
 from physhandi.data.arrays import read_tensors, write_array
-from physhandi.data.environment import processor_name
 from physhandi.data.files import write_bytes, write_json
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.lease import locked_file
@@ -141,7 +140,7 @@ class Bench:
         self.common = dict(common)
         self.device = device
         if device_name is None:
-            device_name = processor_name() if device == "cpu" else describe_device(device)
+            device_name = describe_device(device)
         self.device_name = f"{device} {device_name}"
         self.progress = progress
         self._settings: dict[str, dict[str, Any]] = {}

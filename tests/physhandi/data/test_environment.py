@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physhandi.data.environment import commit_of, describe_environment, processor_name
+from physhandi.data.environment import commit_of, describe_environment
+from physhandi.devices import processor_name
 
 
 def test_the_device_and_the_versions_are_noted() -> None:

@@ -266,7 +266,7 @@ def test_another_processor_computes_a_cell_anew(
     recording = write_sheet(tmp_path / "sheet")
     first = bench_of(tmp_path / "suite").outcome(METHODS["static"], recording).run
     assert bench_of(tmp_path / "suite").outcome(METHODS["static"], recording).run == first
-    monkeypatch.setattr(cells, "processor_name", lambda: "Another One 3000")
+    monkeypatch.setattr(cells, "describe_device", lambda _device: "Another One 3000")
     assert bench_of(tmp_path / "suite").outcome(METHODS["static"], recording).run != first
 
 
