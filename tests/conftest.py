@@ -86,12 +86,16 @@ jaxtyping.jaxtyped = _checked_at_times(jaxtyping.jaxtyped)
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Look for no garbage among modules and tests, which stay: a sixth of what collecting takes."""
+    """Look for no garbage among modules and tests, which stay: a sixth of what collecting takes.
+
+    Later look for it more rarely: each search goes through all that a test holds.
+    """
     gc.disable()
     try:
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(20_000, 20, 20)
         gc.enable()
 
 
