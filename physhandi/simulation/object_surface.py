@@ -10,6 +10,7 @@ the rules for borders and corners of H. Hoppe et al., Piecewise Smooth Surface R
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -140,11 +141,20 @@ def lay_surface(
         most_vertices: The surface is not subdivided beyond this, unless it has more nodes.
 
     Returns:
-        The surface; None where the nodes have none.
+        The surface; None where the nodes have none. It is shared by all who ask for the same.
     """
     point = np.asarray(node, np.float64)
     if len(point) < 4 or not np.isfinite(point).all():
         return None
+    return _lay(point.tobytes(), kind, thickness, most_vertices)
+
+
+@lru_cache(maxsize=8)
+def _lay(
+    nodes: bytes, kind: str | None, thickness: float | None, most_vertices: int
+) -> ObjectSurface | None:
+    """Lay the surface of nodes; kept, since each tab, picture and file of a run asks for it."""
+    point = np.frombuffer(nodes).reshape(-1, 3)
     if kind == "rope" or (kind is None and is_line(point)):
         return _lay_tube(point, thickness, most_vertices)
     faces = triangulate_nodes(point, kind=kind)
