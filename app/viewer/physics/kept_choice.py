@@ -87,8 +87,11 @@ class KeptChoice(Generic[Listed]):
     @property
     def chosen(self) -> Listed | None:
         """The current entry, if there is one; of several the one that was chosen."""
-        fits = {label: entry for label, entry in self._listed.items() if self._is_in_force(entry)}
-        return fits.get(self._wanted, next(iter(fits.values()), None))
+        listed = self._listed
+        wanted = listed.get(self._wanted)
+        if wanted is not None and self._is_in_force(wanted):
+            return wanted
+        return next(filter(self._is_in_force, listed.values()), None)
 
     def want(self, label: str) -> None:
         """Name this one as long as it is in force."""
