@@ -5,6 +5,7 @@ import functools
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any, Protocol, cast, get_type_hints
 
@@ -45,12 +46,42 @@ class _LoopEvent(asyncio.Event):
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()
         self._home = loop
+        self._is_coming = False
 
     def set(self) -> None:
         """Have the loop set it, unless it is set; a loop that is closed has nobody to wake."""
-        if not self.is_set():  # Viser looks for messages after it has cleared the event.
+        # Viser looks for messages after it has cleared the event.
+        if not self.is_set() and not self._is_coming:
+            self._is_coming = True
             with suppress(RuntimeError):
-                self._home.call_soon_threadsafe(super().set)
+                self._home.call_soon_threadsafe(self._arrive)
+
+    def _arrive(self) -> None:
+        self._is_coming = False  # First: what is set from now on may be set for a later message.
+        super().set()
+
+
+class _Waker:
+    """What viser's messages wake: an event loop, once for all that it has not looked at yet.
+
+    For each message viser sets the event, and has the loop set it once more: an eighth of the time
+    in which a scene is opened.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, event: _LoopEvent) -> None:
+        self._loop = loop
+        self._event = event
+
+    def call_soon_threadsafe(self, callback: Callable[..., object], *args: Any) -> None:
+        """Have the loop call something; what sets the event sees to that by itself."""
+        if callback == self._event.set:
+            self._event.set()
+        else:
+            self._loop.call_soon_threadsafe(callback, *args)
+
+    def create_task(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+        """Have the loop work on something."""
+        return self._loop.create_task(work)
 
 
 def start_viser(label: str) -> viser.ViserServer:
@@ -59,7 +90,8 @@ def start_viser(label: str) -> viser.ViserServer:
     Args:
         label: Title of its panel; must be harmless as HTML.
     """
-    rich.get_console().quiet = True  # viser would print its loopback address, which misleads.
+    # Viser would print its loopback address, which misleads; even a quiet console lays it out.
+    cast("Any", rich.get_console()).print = lambda *_, **__: None
     server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
     # Any client could ask for a public tunnel with this message.
     infrastructure: Any = server._websock_server  # noqa: SLF001  # no other way
@@ -67,7 +99,9 @@ def start_viser(label: str) -> viser.ViserServer:
     loop = server.get_event_loop()
 
     def let_threads_send(sender: Any) -> None:
-        sender.get_message_buffer().message_event = _LoopEvent(loop)
+        buffer = sender.get_message_buffer()
+        buffer.message_event = _LoopEvent(loop)
+        buffer.event_loop = _Waker(loop, buffer.message_event)
 
     let_threads_send(infrastructure)
     infrastructure.on_client_connect(let_threads_send)  # Called before anything is sent to it.
