@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.server.server_world import World
 
@@ -12,6 +13,7 @@ from app.cli import main
 from app.exports import gallery
 from app.exports.gallery import GALLERY_FILE, write_gallery
 from app.exports.request import FileRequest
+from app.previews.clip import Clip
 from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
 
@@ -20,7 +22,7 @@ NAME = '<img src=x onerror="alert(1)">'
 
 @pytest.fixture
 def queries(monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, str]]:
-    """Makes small pages in the place of recorded scenes; what they were asked to show."""
+    """Makes small pages and pictures in the place of scenes; what pages were asked to show."""
     asked: list[Mapping[str, str]] = []
 
     def make(order: FileRequest, path: Path, report: object) -> None:
@@ -28,7 +30,9 @@ def queries(monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, str]]:
         asked.append(order.query)
         path.write_text("<html><head><title>Scene</title></head><body></body></html>")
 
+    picture = np.zeros((2, 2, 4), np.uint8)
     monkeypatch.setattr(gallery, "make", make)
+    monkeypatch.setattr(gallery, "clip_of_run", lambda *_, **__: Clip([picture], 40))
     return asked
 
 
