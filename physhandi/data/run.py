@@ -263,16 +263,15 @@ class RunFolder:
         Raises:
             RunError: If no attempt was begun yet.
         """
-        number = self._published() or max(attempt_numbers(self.folder), default=None)
-        if number is None:
+        out = self._newest_out()
+        if out is None:
             raise RunError(f"Run '{self.id}' has no outputs yet: it is {self.state}.")
-        return self.folder / ATTEMPTS / str(number) / OUT
+        return out
 
     def has(self, rel: str) -> bool:
         """Tell whether there is an output of that name."""
-        if self._published() is None and not attempt_numbers(self.folder):
-            return False
-        return inside(self.out, rel).is_file()
+        out = self._newest_out()
+        return out is not None and inside(out, rel).is_file()
 
     def array(self, rel: str, *, mmap: bool = True) -> ndarray:
         """Open an array; mapped ones are read-only.
@@ -448,6 +447,10 @@ class RunFolder:
         trash = self.folder.with_name(f".{self.id}.{secrets.token_hex(4)}.deleted")
         self.folder.replace(trash)
         shutil.rmtree(trash, ignore_errors=True)
+
+    def _newest_out(self) -> Path | None:
+        number = self._published() or max(attempt_numbers(self.folder), default=None)
+        return None if number is None else self.folder / ATTEMPTS / str(number) / OUT
 
     def _published(self) -> int | None:
         number = read_number(self.folder / CURRENT)
