@@ -10,6 +10,7 @@ import socket
 import zipfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path, PurePath
 from stat import S_ISREG
@@ -229,9 +230,10 @@ def parse_yaml(text: str, *, reads_dates: bool = True) -> Any:
         ValueError: If it is not YAML, or a field is there twice; tells the line.
     """
     try:
-        _check_depth(text)
-        # Both are a SafeLoader.
-        return yaml.load(text, Loader=_Loader if reads_dates else _DatelessLoader)  # noqa: S506
+        # Aliases make one value of several places, and tags others than `_copied` copies.
+        if len(text) > _REMEMBERED_LENGTH or "*" in text or "!" in text:
+            return _load_yaml(text, reads_dates)
+        return _copied(_remembered_yaml(text, reads_dates))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         if mark and error.context_mark and mark.line > text.count("\n"):
@@ -251,6 +253,29 @@ _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """PyYAML's reader in C, ten times as fast as that in Python, where PyYAML was built with it."""
 _FastDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 """Its writer in C, five times as fast."""
+
+
+_REMEMBERED_LENGTH = 16_384
+"""Characters of the longest text whose content is remembered."""
+
+
+def _load_yaml(text: str, reads_dates: bool) -> Any:
+    _check_depth(text)
+    # Both are a SafeLoader.
+    return yaml.load(text, Loader=_Loader if reads_dates else _DatelessLoader)  # noqa: S506
+
+
+# Lists and pages of runs read the same small files again and again, each time for milliseconds.
+_remembered_yaml = lru_cache(maxsize=64)(_load_yaml)
+
+
+def _copied(content: Any) -> Any:
+    """Copy lists and fields, so that whoever changes them changes nothing that is remembered."""
+    if isinstance(content, dict):
+        return {key: _copied(value) for key, value in cast("dict[Any, Any]", content).items()}
+    if isinstance(content, list):
+        return [_copied(value) for value in cast("list[Any]", content)]
+    return content
 
 
 def _check_depth(text: str) -> None:

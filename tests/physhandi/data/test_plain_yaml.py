@@ -17,6 +17,22 @@ def test_plain_data_is_read() -> None:
     assert parse_yaml("") is None
 
 
+def test_what_a_reader_changes_no_other_reader_sees() -> None:
+    text = "a: {b: [1, {c: 2020-01-02}]}\n"
+    first = parse_yaml(text)
+    first["a"]["b"][1]["c"] = 3
+    first["a"]["b"].append(4)
+    first["a"]["d"] = first["e"] = 5
+    assert parse_yaml(text, reads_dates=False) == {"a": {"b": [1, {"c": "2020-01-02"}]}}
+    assert parse_yaml(text) == {"a": {"b": [1, {"c": date(2020, 1, 2)}]}}
+
+
+def test_a_wrong_text_is_refused_each_time() -> None:
+    for _ in range(2):
+        with pytest.raises(ValueError, match="line 3, column 1: field 'a' is there twice"):
+            parse_yaml("a: 1\nb: 2\na: 3\n")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
