@@ -62,15 +62,12 @@ class Matcher(torch.nn.Module):
         self.template = patches(image, self.place, self.window)
 
     def step(self, image):
-        best, least = self.place, image.new_full((len(self.place),), torch.inf)
-        for down in range(-self.search, self.search + 1):
-            for across in range(-self.search, self.search + 1):
-                there = self.place + self.place.new_tensor([across, down])
-                cost = ((patches(image, there, self.window) - self.template) ** 2).mean(1)
-                best = torch.where((cost < least)[:, None], there, best)
-                least = torch.minimum(least, cost)
-        self.place = best
-        return self.gain * (best + self.rest), least
+        step = torch.arange(-self.search, self.search + 1, device=image.device)
+        there = self.place[:, None] + torch.cartesian_prod(step, step).flip(1)
+        seen = patches(image, there.flatten(0, 1), self.window).unflatten(0, there.shape[:2])
+        least, best = ((seen - self.template[:, None]) ** 2).mean(2).min(1)
+        self.place = there[torch.arange(len(there)), best]
+        return self.gain * (self.place + self.rest), least
 '''
 
 _HUB = (
