@@ -8,7 +8,7 @@ import io
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 from xml.sax.saxutils import escape
 
@@ -30,6 +30,8 @@ RESAMPLES = 4000
 LEVEL = 0.95
 """Share of the resamples that an interval holds."""
 _SEED = 20250
+_ROWS = 2**15
+"""Intervals that are kept: more than tables of a suite have rows."""
 _HIGHER = ("iou", "psnr", "ssim", "contact_accuracy", "contact_f1")
 _NONE = "–"  # noqa: RUF001  # a dash, as tables have it
 _LATEX = (
@@ -570,8 +572,15 @@ def is_higher_better(metric: str) -> bool:
 
 def interval(value: Float[ndarray, " case"], resamples: int = RESAMPLES) -> tuple[float, float]:
     """Compute the percentile interval of the mean over cases; of one case it is that alone."""
+    return _interval(np.asarray(value, np.float64).tobytes(), resamples)
+
+
+@lru_cache(_ROWS)
+def _interval(value: bytes, resamples: int) -> tuple[float, float]:
+    """Compute an interval once, although tables are written again whenever a cell is finished."""
     tail = (1.0 - LEVEL) / 2.0
-    low, high = np.quantile(resampled_means(value, resamples), (tail, 1.0 - tail))
+    mean = resampled_means(np.frombuffer(value, np.float64), resamples)
+    low, high = np.quantile(mean, (tail, 1.0 - tail))
     return float(low), float(high)
 
 
