@@ -5,6 +5,8 @@ A node's block of the stiffness matrix sums k d dᵀ over the unit directions d 
 
 import warp as wp
 
+wp.set_module_options({"enable_backward": False})
+
 OBJECT, VIRTUAL = 0, 1
 RADIUS, MOST, FLOOR, STIFFNESS, DAMPING = 0, 1, 2, 3, 4
 
