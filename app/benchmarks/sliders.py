@@ -46,8 +46,10 @@ class MeasuredSlider:
             run: A finished run with an object.
             sequence: One of its sequences.
             field: Parameter that the slider moves.
+
+        Raises:
+            UsageError: If that is a switch, or the object has no surface.
         """
-        self._run = run
         self._fitted = FittedObject.of(run, sequence)
         meta = run.yaml(SequenceFiles(sequence).meta)
         unit = "m" if meta.get("metric", True) else str(meta.get("length_unit", "units"))
@@ -56,13 +58,19 @@ class MeasuredSlider:
         knob = controls[field]
         if not isinstance(knob, Knob):
             raise UsageError(f"{field} is a switch, which has no way to be moved along.")
+        surface = load_surface(run, self._fitted.fitted, ())
+        if surface is None:
+            raise UsageError(
+                f"The object of '{run.name}' has no surface whose motion could be heard."
+            )
         self.knob = knob
         self._start = start
+        self._surface = surface
 
     @property
     def fitted(self) -> Float[ndarray, "frame node 3"]:
         """Positions of the surface in the fitted rollout [m]."""
-        return shown_places(self._run, self._fitted.fitted)
+        return self._shown(self._fitted.fitted.position)
 
     def moves(self, count: int) -> list[Move]:
         """Choose positions, each further than the one before, and simulate them.
@@ -78,33 +86,25 @@ class MeasuredSlider:
         chosen: list[Move] = []
         before = self.fitted
         while len(chosen) < count and self.knob.low < value < self.knob.high:
-            value = round(value + step, 6)
-            move = self._move(value)
-            if float(np.abs(move.shown[1] - before[1]).max()) > TOLERANCE:
-                chosen.append(move)
-                before = move.shown
+            value = min(max(round(value + step, 6), self.knob.low), self.knob.high)
+            parameters = self._start.replace(**{self.knob.field: self.knob.from_slider(value)})
+            rollout = self._fitted.begin(parameters)
+            # Most steps of a radius reach no further node; the first frame tells that.
+            for number, _ in enumerate(self._fitted.fill(rollout)):
+                if number == 1 and not self._is_changed(rollout, before):
+                    break
+            else:
+                chosen.append(Move(value, self._shown(rollout.position)))
+                before = chosen[-1].shown
         return chosen
 
-    def _move(self, value: float) -> Move:
-        value = min(max(round(value, 6), self.knob.low), self.knob.high)
-        chosen = {self.knob.field: self.knob.from_slider(value)}
-        parameters = self._start.replace(**chosen)
-        rollout = self._fitted.begin(parameters)
-        for _ in self._fitted.fill(rollout):
-            pass
-        return Move(value, shown_places(self._run, rollout))
+    def _is_changed(self, rollout: ObjectRollout, before: Float[ndarray, "frame node 3"]) -> bool:
+        """Tell whether the first simulated frame differs from the one before."""
+        return float(np.abs(self._surface.place(rollout.position[1]) - before[1]).max()) > TOLERANCE
 
-
-def shown_places(run: Run, rollout: ObjectRollout) -> Float[ndarray, "frame vertex 3"]:
-    """Find where the surface of a rollout's object is in all frames [m].
-
-    Raises:
-        UsageError: If the object has none.
-    """
-    surface = load_surface(run, rollout, ())
-    if surface is None:
-        raise UsageError(f"The object of '{run.name}' has no surface whose motion could be heard.")
-    return np.stack([surface.place(position) for position in rollout.position])
+    def _shown(self, position: Float[ndarray, "frame node 3"]) -> Float[ndarray, "frame vertex 3"]:
+        """Find where the surface is while the nodes are there [m]."""
+        return np.stack([self._surface.place(frame) for frame in position])
 
 
 def is_new_frame(
