@@ -264,6 +264,7 @@ def shared_scene(
         page.goto(served.url)
         scene = ScenePage.opened_from(page)
         scene.pause()
+        scene.calm_down()
         opened.scene = scene
     opened.scene.rest(on=False)
     failed = request.session.testsfailed
