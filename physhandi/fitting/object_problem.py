@@ -444,7 +444,13 @@ def simulate_problem(
     problem: ObjectProblem, model: SpringMassModel, parameters: SimulationParameters, device: str
 ) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
     """Simulate the frames to fit; returns positions [m] and velocities [m/s]."""
-    simulator = Simulator(model, problem_parameters(parameters, problem), device=device)
+    return rollout_in(Simulator(model, problem_parameters(parameters, problem), device), problem)
+
+
+def rollout_in(
+    simulator: Simulator, problem: ObjectProblem
+) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
+    """Simulate the frames to fit in a simulator of the problem's; see `simulate_problem`."""
     rollout = simulator.rollout(problem.control[: problem.frame_count])
     return torch.from_numpy(rollout.position), torch.from_numpy(rollout.velocity)
 
@@ -464,10 +470,35 @@ def mean_loss(
     The mean is over the frames 1, 2, … to fit (physics.md §4.1); frame 0 is the initial state.
     `on_rollout` receives each simulated motion [m].
     """
+
+    def simulate(problem: ObjectProblem) -> tuple[Tensor, Tensor]:
+        return simulate_problem(problem, models[problem.name], parameters, device)
+
+    return mean_loss_of(
+        problems,
+        simulate,
+        config,
+        acceleration_weight=acceleration_weight,
+        on_rollout=on_rollout,
+    )
+
+
+def mean_loss_of(
+    problems: Many[ObjectProblem],
+    simulate: Callable[[ObjectProblem], tuple[Tensor, Tensor]],
+    config: ObjectFitConfig,
+    *,
+    acceleration_weight: float = 0.0,
+    on_rollout: Callable[[ObjectProblem, Float[Tensor, "frame node 3"]], None] | None = None,
+) -> float:
+    """Average the frame losses of rollouts as `mean_loss` does, however they are simulated [m²].
+
+    `simulate` gives what `simulate_problem` gives.
+    """
     losses = []
     for problem in problems:
         try:
-            node, velocity = simulate_problem(problem, models[problem.name], parameters, device)
+            node, velocity = simulate(problem)
         except SimulationDivergedError:
             return math.inf
         node, velocity = (state.to(problem.cloud.device) for state in (node, velocity))

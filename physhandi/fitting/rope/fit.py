@@ -20,8 +20,9 @@ from physhandi.errors import FitError, SimulationDivergedError
 from physhandi.fitting.config import ObjectFitConfig
 from physhandi.fitting.object_problem import (
     ObjectProblem,
-    mean_loss,
+    mean_loss_of,
     problem_parameters,
+    rollout_in,
     settle_substeps,
 )
 from physhandi.fitting.preview import RolloutPreview
@@ -235,10 +236,12 @@ class RopeFit:
 
     def loss(self, bending: Bending) -> float:
         """Give the mean loss of rollouts from frame 0, infinite if one diverges [m²]."""
-        models = self.models(bending)
-        parameters = self.parameters.replace(drag=bending.drag)
+
+        def simulate(problem: ObjectProblem) -> tuple[torch.Tensor, torch.Tensor]:
+            return rollout_in(self._simulator(problem, bending), problem)
+
         show = self._preview.update
-        loss = mean_loss(self._problems, models, parameters, self._config, "cpu", on_rollout=show)
+        loss = mean_loss_of(self._problems, simulate, self._config, on_rollout=show)
         self._preview.show(loss)
         return loss
 
@@ -322,13 +325,7 @@ class RopeFit:
     ) -> Float[ndarray, "seen 3"] | None:
         """Give how far the markers are from where they were seen [m]; None if the rope diverges."""
         self._progress.check_cancelled()
-        simulator = self._simulators.get(problem.name)
-        if simulator is None:
-            model = rope_model(problem, self.parameters, bending)
-            simulator = Simulator(model, problem_parameters(self.parameters, problem))
-            self._simulators[problem.name] = simulator
-        simulator.set_rod(bent(simulator.model, bending))
-        simulator.set_parameters(simulator.parameters.replace(drag=bending.drag))
+        simulator = self._simulator(problem, bending)
         control = problem.control[: problem.frame_count]
         node = np.empty((problem.frame_count, *problem.object_node.shape), np.float32)
         seen = self._seen[problem.name]
@@ -343,6 +340,20 @@ class RopeFit:
         track = problem.predict_tracks(torch.from_numpy(node[1:]))
         error = (track - problem.track[1:])[problem.is_valid[1:]]
         return error.numpy().astype(np.float64)
+
+    def _simulator(self, problem: ObjectProblem, bending: Bending) -> Simulator:
+        """Give the one simulator of a sequence other numbers.
+
+        To record the launches of a frame anew takes as long as a rollout.
+        """
+        simulator = self._simulators.get(problem.name)
+        if simulator is None:
+            model = rope_model(problem, self.parameters, bending)
+            simulator = Simulator(model, problem_parameters(self.parameters, problem))
+            self._simulators[problem.name] = simulator
+        simulator.set_rod(bent(simulator.model, bending))
+        simulator.set_parameters(simulator.parameters.replace(drag=bending.drag))
+        return simulator
 
 
 def _windows(
