@@ -25,7 +25,7 @@ from physhandi.data.observation import ObjectObservation
 from physhandi.data.sequence_meta import ShapeClass
 from physhandi.fitting.rest_state import node_distance
 from physhandi.fitting.search_bounds import neighbor_distance
-from physhandi.metrics.baselines import last_residual, placed_tracks
+from physhandi.metrics.baselines import Spread, placed_tracks, predicted_places
 from physhandi.rotations import best_rotations
 from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 
@@ -227,20 +227,21 @@ def observed_nodes(
 
     In a frame that shows no track whose place on the object is known they stay where they were.
     """
+    start, of_track = node.astype(np.float64), observation.node_of_track
+    is_placed, place = placed_tracks(start, observation.point, observation.is_visible, of_track)
     seen = np.empty((frame_count, *node.shape))
     seen[0] = node
+    shown, spread, still = np.zeros(len(place), bool), None, place
     for frame in range(1, frame_count):
-        try:
-            seen[frame] = node + last_residual(
-                node,
-                node,
-                observation.point,
-                observation.is_visible,
-                frame,
-                observation.node_of_track,
-            )
-        except ValueError:
+        if not is_placed[frame].any():
             seen[frame] = seen[frame - 1]
+            continue
+        # Neighbouring frames mostly show the same tracks.
+        if spread is None or not np.array_equal(is_placed[frame], shown):
+            shown = is_placed[frame]
+            anchor, of_shown = place[shown], None if of_track is None else of_track[shown]
+            spread, still = Spread(start, anchor), predicted_places(start, start, anchor, of_shown)
+        seen[frame] = node + spread.over_nodes(observation.point[frame, shown] - still)
     return seen
 
 

@@ -94,12 +94,24 @@ def last_residual(  # noqa: PLR0917  (the object at two times, then what was see
         ValueError: If the frame shows no track whose place on the object is known.
     """
     anchor, residual = track_residuals(start, now, point, is_visible, frame, node_of_track)
-    tree: Any = KDTree(anchor)
-    count = min(CARRIERS, len(anchor))
-    distance, near = tree.query(start.astype(np.float64), k=count)
-    weight = 1.0 / (np.reshape(distance, (-1, count)) + 1e-6)
-    weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("nc,nci->ni", weight, residual[np.reshape(near, (-1, count))])
+    return Spread(start, anchor).over_nodes(residual)
+
+
+class Spread:
+    """Interpolates over nodes what is known at places; made once for the same of both."""
+
+    def __init__(self, node: Float[ndarray, "node 3"], place: Float[ndarray, "place 3"]) -> None:
+        """Find the eight places nearest to each node, weighted by inverse distance."""
+        tree: Any = KDTree(place)
+        count = min(CARRIERS, len(place))
+        distance, near = tree.query(node.astype(np.float64), k=count)
+        self._near = np.reshape(near, (-1, count))
+        self._weight = 1.0 / (np.reshape(distance, (-1, count)) + 1e-6)
+        self._weight /= self._weight.sum(axis=1, keepdims=True)
+
+    def over_nodes(self, value: Float[ndarray, "place 3"]) -> Float[ndarray, "node 3"]:
+        """Interpolate a value of each place."""
+        return np.einsum("nc,nci->ni", self._weight, value[self._near])
 
 
 def track_residuals(  # noqa: PLR0917  (the object at two times, then what was seen of it)
@@ -133,11 +145,27 @@ def track_residuals(  # noqa: PLR0917  (the object at two times, then what was s
     if not is_usable.any():
         raise ValueError(f"frame {frame} shows no track that frame 0 places on the object")
     anchor = place[is_usable]
-    if node_of_track is not None:
-        predicted = now[node_of_track[is_usable]]
-    else:
-        predicted = carried_points(anchor, np.stack([start, now]))[1]
-    return anchor, point[frame, is_usable] - predicted
+    node_of_usable = None if node_of_track is None else node_of_track[is_usable]
+    return anchor, point[frame, is_usable] - predicted_places(start, now, anchor, node_of_usable)
+
+
+def predicted_places(
+    start: Float[ndarray, "node 3"],
+    now: Float[ndarray, "node 3"],
+    place: Float[ndarray, "place 3"],
+    node_of_place: Int[ndarray, " place"] | None = None,
+) -> Float[ndarray, "place 3"]:
+    """Tell where nodes that moved put places of frame 0 [m].
+
+    Args:
+        start: Nodes in frame 0 [m].
+        now: Nodes later [m].
+        place: Places in frame 0 [m].
+        node_of_place: Node that each of them is; None lets the nodes around it carry it.
+    """
+    if node_of_place is not None:
+        return now[node_of_place]
+    return carried_points(place, np.stack([start, now]))[1]
 
 
 def placed_tracks(
