@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.fitting.contact_detection import find_contacts
+from physhandi.fitting.contact_detection import find_contacts, observed_nodes
+from physhandi.metrics.baselines import last_residual
 from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 
 SPACING, RATE, FRAMES = 0.01, 30.0, 40
@@ -372,3 +373,22 @@ def test_what_moves_over_the_ground_with_a_hand_beside_it_is_held(
         assert contacts.distance.min() == pytest.approx(0.018)
     # Where nothing weighs anything, nothing is held by friction.
     assert len(find_contacts(what, SHEET, control, **fields).node) == 0
+
+
+@pytest.mark.parametrize("follows_late_tracks", [False, True])
+def test_nodes_are_seen_in_a_frame_as_its_tracks_alone_say(follows_late_tracks: bool) -> None:
+    random = np.random.default_rng(1)
+    node, place = random.random((20, 3)), random.random((30, 3))
+    point = (place + random.normal(scale=0.1, size=(6, 30, 3))).astype(np.float32)
+    is_visible = np.ones((6, 30), bool)
+    is_visible[2:5, :12] = False
+    is_visible[3] = False
+    of_track = random.integers(0, 20, 30) if follows_late_tracks else None
+    observation = ObjectObservation(
+        point=point, is_visible=is_visible, is_motion_valid=is_visible, node_of_track=of_track
+    )
+    seen = observed_nodes(observation, node, 6)
+    for frame in (1, 2, 4, 5):
+        own = last_residual(node, node, point, is_visible, frame, of_track)
+        np.testing.assert_array_equal(seen[frame], node + own)
+    np.testing.assert_array_equal(seen[3], seen[2])
