@@ -374,8 +374,9 @@ def test_a_parameter_to_be_put_back_is_not_forgotten_before_it_is_heard(
         assert session._object is not None
         panel = session._object.panel
         client.set("drag [1/s]", 9.0)
-        # The last that is written of a change: what offers it has been set back by then.
+        # The last that is written of a change: what offers it has been handed in by then.
         client.until(lambda: "drag" in panel._changes.content)
+        write_all(session)
         # As viser keeps what a user has chosen, before it is told to anybody.
         panel._put_back.handle._impl.value = "drag [1/s]"
         panel._show_changes()
