@@ -401,8 +401,8 @@ class RunFolder:
             if live_holder(self.folder) is not None:
                 raise RunError(f"Run '{self.id}' is running. Cancel it before you start it anew.")
             # The next attempt goes on from the latest one, so that one has to be empty.
-            latest = max(attempt_numbers(self.folder), default=0)
-            if latest:
+            latest = self.attempt
+            if latest is not None:
                 (self.folder / ATTEMPTS / str(latest + 1) / OUT).mkdir(parents=True)
                 prune(self.folder, keep={latest + 1})
 
@@ -449,7 +449,7 @@ class RunFolder:
         shutil.rmtree(trash, ignore_errors=True)
 
     def _newest_out(self) -> Path | None:
-        number = self._published() or max(attempt_numbers(self.folder), default=None)
+        number = self._published() or self.attempt
         return None if number is None else self.folder / ATTEMPTS / str(number) / OUT
 
     def _published(self) -> int | None:
