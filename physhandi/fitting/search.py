@@ -69,11 +69,6 @@ def search_parameters(
     Raises:
         FitError: If every candidate diverges.
     """
-    with warnings.catch_warnings():
-        # cma warns that it cannot import matplotlib, which only its unused plots need.
-        warnings.filterwarnings("ignore", message="Could not import matplotlib")
-        import cma
-
     ((start, loss_before),) = evaluate([start])
     if not config.variables or config.generations == 0:
         return SearchResult(
@@ -82,6 +77,10 @@ def search_parameters(
             loss_after=loss_before,
             curve=[[1.0, loss_before]],
         )
+    with warnings.catch_warnings():
+        # cma warns that it cannot import matplotlib, which only its unused plots need.
+        warnings.filterwarnings("ignore", message="Could not import matplotlib")
+        import cma
     search = _Search(cma, evaluate, start, loss_before, config, progress)
     search.evolve(config.variables, start, config.generations)
     if not math.isfinite(search.best_loss):
