@@ -10,9 +10,8 @@ from pathlib import Path
 
 import cv2
 
-from app.previews.clip import clip_of_run, clip_of_sequence
 from app.previews.files import MOVING, NONE, SECONDS_EACH, STILL
-from physhandi.child import Channel, run_child
+from physhandi.child import Channel, loading_modules, run_child
 from physhandi.data.files import write_bytes
 from physhandi.errors import describe
 
@@ -30,6 +29,8 @@ def draw(order: Mapping[str, str], *, is_still: bool) -> None:
     target = order["target"]
     if Path(f"{target}{NONE}").exists():
         return
+    from app.previews.clip import clip_of_run, clip_of_sequence
+
     show = clip_of_run if order["kind"] == "run" else clip_of_sequence
     try:
         clip = show(Path(order["folder"]), is_still=is_still)
@@ -49,6 +50,8 @@ def draw(order: Mapping[str, str], *, is_still: bool) -> None:
 def draw_all(channel: Channel) -> None:
     """Draw what the server asks for, out of its way."""
     os.nice(_POLITENESS)
+    with loading_modules():
+        import app.previews.clip  # noqa: F401  # before time counts
     cv2.setNumThreads(1)
     logging.getLogger("physhandi").setLevel(logging.ERROR)
     orders: list[dict[str, str]] = list(channel.requests())

@@ -287,7 +287,7 @@ class SimulationClient:
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = start_module(
-                "app.viewer.live.worker",
+                "app.viewer.live",
                 str(theirs.fileno()),
                 self._device,
                 pass_fds=[theirs.fileno()],

@@ -1,6 +1,6 @@
 """The live simulation process: simulates what the sliders of all sessions ask for.
 
-Started as ``python -m app.viewer.live.worker FD`` with one end of a socket pair. One thread
+Started as ``python -m app.viewer.live FD DEVICE`` with one end of a socket pair. One thread
 reads requests into a mailbox, where a session's newer request replaces its older one; the main
 thread simulates one frame of each active session in turn. The process ends when its parent does.
 """
@@ -19,7 +19,7 @@ import warp as wp
 
 from app.viewer.live.drive import Drives, HandLimits
 from app.viewer.live.wire import DRIVE, PAUSE, RESUME, STEER, STEP, Message, receive, send
-from physhandi.child import Channel, run_child
+from physhandi.child import Channel
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.fitted_object import FittedObject
 from physhandi.simulation.edits import Edits, decode_edits
@@ -368,7 +368,7 @@ def warm_up(device: str) -> None:
         logger.exception("the live simulation could not be prepared")
 
 
-def _work(channel: Channel) -> None:
+def serve_simulations(channel: Channel) -> None:
     """Serve requests from the socket whose descriptor is the first argument."""
     descriptor, device = channel.arguments
     if device == "auto":
@@ -378,7 +378,3 @@ def _work(channel: Channel) -> None:
     logging.basicConfig(level=logging.INFO, format="live simulation: %(levelname)s %(message)s")
     with socket.socket(fileno=int(descriptor)) as connection:
         SimulationWorker(connection, device).run()
-
-
-if __name__ == "__main__":
-    run_child(_work)

@@ -88,7 +88,7 @@ def test_it_needs_no_package_of_the_server() -> None:
     missing = ["fastapi", "pydantic", "torch", "tyro", "uvicorn", "viser"]
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({missing!r}))\n"
-        "import app.benchmarks.latency, app.viewer.live.worker, app.viewer.live.worker\n"
+        "import app.benchmarks.latency, app.viewer.live.worker\n"
         "print('imported')"
     )
     command = [sys.executable, "-c", code]
