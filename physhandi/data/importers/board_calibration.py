@@ -185,11 +185,16 @@ def _seen_in(gray: ndarray, factor: int, target: CharucoTarget) -> BoardSighting
     gray, detection = _enlarged(gray, factor), _detection()
     best: BoardSighting | None = None
     for family in _FAMILIES:
+        dictionary = target.board(family, is_legacy=False).getDictionary()
+        marker, name, _ = _aruco.ArucoDetector(dictionary, detection).detectMarkers(gray)
+        if name is None or len(name) == 0:
+            continue
         # Before version 4.6, OpenCV printed boards with even rows the other way around.
         for is_legacy in (False, True) if target.rows % 2 == 0 else (False,):
             board = target.board(family, is_legacy=is_legacy)
             detector = _aruco.CharucoDetector(board, _aruco.CharucoParameters(), detection)
-            pixel, number, _, _ = detector.detectBoard(gray)
+            # Both have the same markers, which take longest to find.
+            pixel, number, _, _ = detector.detectBoard(gray, markerCorners=marker, markerIds=name)
             if number is None or len(number) < _LEAST_CORNERS:
                 continue
             corner = np.asarray(board.getChessboardCorners(), np.float64)[np.ravel(number)]
