@@ -9,7 +9,6 @@ import viser
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from app.exports.scene_picture import draw_scene
 from app.viewer.color.legend import draw_legend
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose, SessionState
@@ -121,6 +120,9 @@ class Offscreen:
         Returns:
             Red, green, blue.
         """
+        # Recordings, for which no picture is drawn, would wait for what draws to be loaded.
+        from app.exports.scene_picture import draw_scene
+
         legend = self._scene.painter.legend
         image = draw_scene(self.server, pose or self.pose, *size, is_dark=self.is_dark)
         return image if legend is None else draw_legend(image, legend, is_dark=self.is_dark)
