@@ -49,10 +49,6 @@ def serve(
             everything and change nothing (PHYSHANDI_READ_ONLY_TOKEN_FILE).
         demo: Also queue a quick fit of the bundled sequence.
     """
-    with loading_modules():
-        from app.logs import write_logs
-        from app.server import serve as serve_application
-
     settings = read_settings(
         host=host,
         port=port,
@@ -69,6 +65,11 @@ def serve(
         RunStore(settings.store)  # Tells a wrong address now, not at the end of the first fit.
     named = settings.device if "device" in settings.model_fields_set else "all"
     settings = settings.model_copy(update={"device": ",".join(pick_devices(named))})
+    # What is wrong with the settings is told at once, before the server is loaded.
+    with loading_modules():
+        from app.logs import write_logs
+        from app.server import serve as serve_application
+
     write_logs(settings)
 
     def announce(urls: list[str]) -> None:
