@@ -143,10 +143,22 @@ class ManoHand(HandModel):
         scale: float | Float[Tensor, ""] = 1.0,
     ) -> Float[Tensor, "batch 21 3"]:
         """Pose the keypoints alone; see `HandModel`."""
+        keypoint = self.local_keypoints(shape, articulation)
+        return place(keypoint, wrist_rotation, wrist_translation, scale)
+
+    def local_vertices(
+        self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
+    ) -> Float[Tensor, "batch vertex 3"]:
+        """Pose the surface in the wrist's frame; see `HandModel`."""
+        return self._skin("", shape, self._pose_bones(shape, articulation))
+
+    def local_keypoints(
+        self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
+    ) -> Float[Tensor, "batch 21 3"]:
+        """Pose the keypoints in the wrist's frame; see `HandModel`."""
         bones = self._pose_bones(shape, articulation)
         tip = self._skin("tip_", shape, bones)
-        keypoint = torch.cat([bones.joint + bones.moved, tip], 1)[:, _KEYPOINT]
-        return place(keypoint, wrist_rotation, wrist_translation, scale)
+        return torch.cat([bones.joint + bones.moved, tip], 1)[:, _KEYPOINT]
 
     def chosen_vertices(
         self,

@@ -95,6 +95,18 @@ class HandModel(ABC):
         """Compute where the bones begin in the unposed hand: the wrist, then the 15 joints [m]."""
 
     @abstractmethod
+    def local_vertices(
+        self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
+    ) -> Float[Tensor, "batch vertex 3"]:
+        """Compute the surface alone, in the wrist's frame [m, before scale]."""
+
+    @abstractmethod
+    def local_keypoints(
+        self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
+    ) -> Float[Tensor, "batch 21 3"]:
+        """Compute the keypoints alone, in the wrist's frame [m, before scale]."""
+
+    @abstractmethod
     def keypoints(
         self,
         shape: Float[Tensor, " 10"],

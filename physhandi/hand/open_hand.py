@@ -242,9 +242,22 @@ class OpenHand(HandModel):
         scale: float | Float[Tensor, ""] = 1.0,
     ) -> Float[Tensor, "batch 21 3"]:
         """Pose the keypoints alone; see `HandModel`."""
-        skeleton = self._skeleton(shape)
-        keypoint = self._skin("keypoint", skeleton, *self._turn_bones(skeleton, articulation))
+        keypoint = self.local_keypoints(shape, articulation)
         return place(keypoint, wrist_rotation, wrist_translation, scale)
+
+    def local_vertices(
+        self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
+    ) -> Float[Tensor, "batch vertex 3"]:
+        """Pose the surface in the wrist's frame; see `HandModel`."""
+        skeleton = self._skeleton(shape)
+        return self._skin("vertex", skeleton, *self._turn_bones(skeleton, articulation))
+
+    def local_keypoints(
+        self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
+    ) -> Float[Tensor, "batch 21 3"]:
+        """Pose the keypoints in the wrist's frame; see `HandModel`."""
+        skeleton = self._skeleton(shape)
+        return self._skin("keypoint", skeleton, *self._turn_bones(skeleton, articulation))
 
     def chosen_vertices(
         self,

@@ -39,15 +39,13 @@ class PosedHands:
 
     def keypoints(self) -> Float[Tensor, "hand 21 3"]:
         """Pose the keypoints [m, before scale]."""
-        still = torch.zeros_like(self.parameters["translation"])
         articulation = self.parameters["articulation"]
-        return self._placed(self.model.keypoints(self.shape(), articulation, still, still))
+        return self._placed(self.model.local_keypoints(self.shape(), articulation))
 
     def surface(self) -> Float[Tensor, "hand vertex 3"]:
         """Pose the surfaces' vertices [m, before scale]."""
-        still = torch.zeros_like(self.parameters["translation"])
         articulation = self.parameters["articulation"]
-        return self._placed(self.model(self.shape(), articulation, still, still).vertex)
+        return self._placed(self.model.local_vertices(self.shape(), articulation))
 
     def normals(self, surface: Float[Tensor, "hand vertex 3"]) -> Float[Tensor, "hand vertex 3"]:
         """Compute the unit normals of posed surfaces."""
