@@ -46,6 +46,8 @@ _BINS = (32, 64, 64)
 """Bins of a color histogram along L, a and b of CIELAB, each 0 to 255."""
 _BLUR = 1.0
 """Width of the kernel that makes a density of a histogram [bins]."""
+_BLUR_REACH = 4
+"""Distance at which that kernel ends [bins]."""
 _NEW_ON_BACKGROUND = 0.01
 """Density of colors that the background has not shown; 1 is that of all colors being alike."""
 _NEW_ON_OBJECT = 0.06
@@ -495,7 +497,9 @@ class _Colors:
 
     def add(self, code: Int[ndarray, " pixel"], weight: float = 1.0) -> None:
         """Count pixels by the number of their color."""
-        self._count += np.float32(weight) * np.bincount(code, minlength=self._count.size)
+        count = np.bincount(code)
+        seen = np.flatnonzero(count)  # Pixels show few of all colors.
+        self._count[seen] += np.float32(weight) * count[seen]
         self._logarithm = None
 
     def replace(self, code: Int[ndarray, " pixel"]) -> None:
@@ -519,10 +523,30 @@ class _Colors:
     def log_density(self, code: Int[ndarray, "*shape"]) -> Float[ndarray, "*shape"]:
         """Compute how much more often than all colors on average these are shown (logarithm)."""
         if self._logarithm is None:
-            dense = gaussian_filter(self._count.reshape(_BINS), _BLUR, mode="nearest")
+            count = self._count.reshape(_BINS)
+            dense = np.zeros_like(count)
+            near = _near_nonzero(count, _BLUR_REACH)
+            dense[near] = gaussian_filter(count[near], _BLUR, mode="nearest", radius=_BLUR_REACH)
             dense *= dense.size / max(float(dense.sum()), 1e-9)
-            self._logarithm = np.log((1 - self._new) * dense + self._new).reshape(-1)
+            logarithm = np.full_like(dense, np.log(np.float32(self._new)))
+            logarithm[near] = np.log((1 - self._new) * dense[near] + self._new)
+            self._logarithm = logarithm.reshape(-1)
         return self._logarithm[code]
+
+
+def _near_nonzero(count: Float[ndarray, "a b c"], reach: int) -> tuple[slice, ...]:
+    """Find the smallest box with everything that is not zero, and cells around it.
+
+    A filter of that reach gives the same there as in the whole array, and zero elsewhere.
+    """
+    box: list[slice] = []
+    rest = count
+    for axis in range(3):
+        found = np.flatnonzero(rest.any(axis=tuple(other for other in range(3) if other != axis)))
+        low, high = (found[0], found[-1] + 1) if len(found) else (0, 0)
+        box.append(slice(max(0, int(low) - reach), int(high) + reach))
+        rest = count[*box]
+    return tuple(box)
 
 
 class _Image:
