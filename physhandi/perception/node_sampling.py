@@ -18,14 +18,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.ndimage import binary_closing, binary_fill_holes
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, KDTree, QhullError
 
 from physhandi.perception.object_points import WIDEST_GAP, WIDEST_HIDDEN_GAP
 from physhandi.perception.shape_class import (
     STANDING_HEIGHT,
     HiddenTest,
-    links,
+    pieces,
     poisson_disk_points,
     rim_points,
 )
@@ -256,7 +255,7 @@ def rope_nodes(
         is_hidden: Where the rope may continue unseen.
     """
     node = poisson_disk_points(cloud, _PACKING * spacing)
-    piece = connected_components(links(node, _TOUCHING * spacing), directed=False)[1]
+    piece = pieces(node, _TOUCHING * spacing)
     widest = WIDEST_GAP if is_hidden is None else WIDEST_HIDDEN_GAP
     pair, across, length = _gaps(node, np.arange(len(node)), spacing, widest)
     is_between = piece[pair[:, 0]] != piece[pair[:, 1]]

@@ -20,12 +20,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from physhandi.data.view import View
 from physhandi.perception.lifting import OBJECT_LABEL
-from physhandi.perception.shape_class import HiddenTest, links
+from physhandi.perception.shape_class import HiddenTest, pieces
 
 LEAST_PIECE = 0.03
 """Points of a real piece, as a share of those of the largest one."""
@@ -160,7 +159,7 @@ def _is_in_real_piece(
         count = math.ceil(distance[first] / (0.5 * cell))
         return bool(is_possible(np.linspace(piece[first], tree.data[nearest[first]], count)).all())
 
-    label = connected_components(links(cloud, 2.0 * cell), directed=False)[1]
+    label = pieces(cloud, 2.0 * cell)
     count = np.bincount(label)
     # Of pieces of one size, the one whose first point comes first in space is the largest.
     first = np.lexsort(cloud.T[::-1])

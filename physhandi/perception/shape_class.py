@@ -62,6 +62,8 @@ _ROUND = 0.35
 """Thickness of wider ropes, in widths."""
 _SHORT_RIM = 0.7
 """Rim of a shell, in circumferences of a disc of the same area."""
+_ASKED_AT_ONCE = 32
+"""Points whose surroundings are looked for together when a cloud is thinned."""
 _LEAST_NEIGHBORS = 3
 """Neighbors from which a point has a tangent plane."""
 _FREE_ANGLE = 2 * np.pi / 3
@@ -142,10 +144,16 @@ def poisson_disk_points(
     cloud = cloud[np.lexsort(cloud.T[::-1])]
     is_left = np.ones(len(cloud), dtype=bool)
     chosen: list[int] = []
-    for index, around in enumerate(KDTree(cloud).query_ball_point(cloud, distance)):
-        if is_left[index]:
-            chosen.append(index)
-            is_left[around] = False
+    tree, left = KDTree(cloud), np.arange(len(cloud))
+    while len(left):
+        # Some at once, which takes less time; most of the others are dropped without being asked.
+        asked = left[:_ASKED_AT_ONCE]
+        for index, around in zip(asked, tree.query_ball_point(cloud[asked], distance), strict=True):
+            if is_left[index]:
+                chosen.append(index)
+                is_left[around] = False
+        left = left[len(asked) :]
+        left = left[is_left[left]]
     point = cloud[chosen]
     for _ in range(rounds):
         owner = KDTree(point).query(cloud)[1]
@@ -204,6 +212,16 @@ def links(point: Float[ndarray, "point 3"], reach: float) -> coo_array:
     pair = KDTree(point).query_pairs(reach, output_type="ndarray")
     length = np.linalg.norm(point[pair[:, 0]] - point[pair[:, 1]], axis=1)
     return coo_array((length, (pair[:, 0], pair[:, 1])), shape=(len(point), len(point)))
+
+
+def pieces(point: Float[ndarray, "point 3"], reach: float) -> Int[ndarray, " point"]:
+    """Number the pieces into which points fall that are farther apart than `reach`."""
+    pair = KDTree(point).query_pairs(reach, output_type="ndarray")
+    ends = (pair[:, 0], pair[:, 1])
+    graph = coo_array((np.ones(len(pair)), ends), shape=(len(point), len(point)))
+    # No pair comes twice, and their order does not matter here: to sort them takes longest.
+    graph.has_canonical_format = True
+    return connected_components(graph, directed=False)[1]
 
 
 def _extent(point: Float[ndarray, "point 3"]) -> Float[ndarray, " axis"]:
