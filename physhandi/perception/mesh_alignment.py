@@ -381,8 +381,9 @@ def _different(poses: list[Alignment]) -> list[Alignment]:
     """Keep the first of those that have come to nearly the same rotation."""
     different: list[Alignment] = []
     for pose in poses:
-        turns = [other.rotation.T @ pose.rotation for other in different]
-        if all(Rotation.from_matrix(turn).magnitude() > _SAME for turn in turns):
+        turns = np.array([other.rotation.T @ pose.rotation for other in different])
+        angles = Rotation.from_matrix(turns.reshape(-1, 3, 3)).magnitude()
+        if (angles > _SAME).all():
             different.append(pose)
     return different
 
