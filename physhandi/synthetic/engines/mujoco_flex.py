@@ -5,7 +5,9 @@ stepping. MuJoCo runs in one thread, so the same input gives the same bits on th
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from importlib import import_module
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -176,10 +178,11 @@ class _World:
         count = np.zeros(self._body.node_count, dtype=np.int64)
         times = (frame + np.arange(_TARGETS_PER_FRAME + 1) / _TARGETS_PER_FRAME) / FRAME_RATE
         targets = [self._targets(float(time)) for time in times]
+        ways = [self._way(before, after) for before, after in pairwise(targets)]
         for step in range(substeps):
             part = (step + 1) / substeps * _TARGETS_PER_FRAME
             first = min(int(part), _TARGETS_PER_FRAME - 1)
-            self._move_targets(targets[first], targets[first + 1], part - first)
+            self._move_targets(targets[first], ways[first], part - first)
             self._mujoco.mj_step(self._model, self._data)
             self._check(frame + 1, step)
             node, bone = self._touches()
@@ -207,18 +210,24 @@ class _World:
         place = [m[:3, :3] @ b.center + m[:3, 3] for m, b in zip(each, self._bones, strict=True)]
         return np.array(place), Rotation.from_matrix(np.array([m[:3, :3] for m in each]))
 
-    def _move_targets(self, before: Any, after: Any, part: float) -> None:
-        """Interpolate the targets between two times."""
+    def _way(self, before: Any, after: Any) -> tuple[Float[ndarray, "bone 3"], ndarray]:
+        """Tell where targets go next, and the rotation vectors of how they turn on the way."""
+        if not self._bones:
+            return after[0], np.zeros((0, 3))
+        return after[0], (after[1] * before[1].inv()).as_rotvec()
+
+    def _move_targets(self, before: Any, way: tuple[ndarray, ndarray], part: float) -> None:
+        """Interpolate the targets on their way."""
         if not self._bones:
             return
-        self._data.mocap_pos[self._target] = (1 - part) * before[0] + part * after[0]
-        turn = (after[1] * before[1].inv()).as_rotvec()
+        place, turn = way
+        self._data.mocap_pos[self._target] = (1 - part) * before[0] + part * place
         rotation = Rotation.from_rotvec(part * turn) * before[1]
         self._data.mocap_quat[self._target] = rotation.as_quat(scalar_first=True)
 
     def _put_hands(self, targets: tuple[Float[ndarray, "bone 3"], Rotation]) -> None:
         """Set the bones to their targets."""
-        self._move_targets(targets, targets, 0.0)
+        self._move_targets(targets, self._way(targets, targets), 0.0)
         for bone, target in zip(self._bone_body, self._target, strict=True):
             start = self._model.jnt_qposadr[self._model.body_jntadr[bone]]
             self._data.qpos[start : start + 3] = self._data.mocap_pos[target]
@@ -232,6 +241,8 @@ class _World:
         mine = (geom >= 0) & (flex >= 0) & (contact.dist < _TOUCH)
         mine[mine] &= self._is_hand[geom[mine]]
         index = np.flatnonzero(mine)
+        if not len(index):
+            return index, index
         place = np.searchsorted(self._bone_body, self._model.geom_bodyid[geom[index]])
         vertex, element = contact.vert[index].max(axis=1), contact.elem[index].max(axis=1)
         is_vertex = vertex >= 0
@@ -262,7 +273,7 @@ class _World:
             node=node,
         )
 
-    @property
+    @cached_property
     def _node_dof(self) -> Int[ndarray, "node 3"]:
         first = self._model.body_dofadr[self._model.flex_vertbodyid]
         return first[:, None] + np.arange(3)
