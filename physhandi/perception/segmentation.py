@@ -540,12 +540,12 @@ def _near_nonzero(count: Float[ndarray, "a b c"], reach: int) -> tuple[slice, ..
     A filter of that reach gives the same there as in the whole array, and zero elsewhere.
     """
     box: list[slice] = []
-    rest = count
+    inner = count
     for axis in range(3):
-        found = np.flatnonzero(rest.any(axis=tuple(other for other in range(3) if other != axis)))
-        low, high = (found[0], found[-1] + 1) if len(found) else (0, 0)
+        used = np.flatnonzero(inner.any(axis=tuple(other for other in range(3) if other != axis)))
+        low, high = (used[0], used[-1] + 1) if len(used) else (0, 0)
         box.append(slice(max(0, int(low) - reach), int(high) + reach))
-        rest = count[*box]
+        inner = count[*box]
     return tuple(box)
 
 
