@@ -134,18 +134,6 @@ class ManoHand(HandModel):
         wrist = (wrist_rotation, wrist_translation, scale)
         return HandPose(place(vertex, *wrist), place(keypoint, *wrist))
 
-    def keypoints(
-        self,
-        shape: Float[Tensor, " 10"],
-        articulation: Float[Tensor, "batch 15 3"],
-        wrist_rotation: Float[Tensor, "batch 3"],
-        wrist_translation: Float[Tensor, "batch 3"],
-        scale: float | Float[Tensor, ""] = 1.0,
-    ) -> Float[Tensor, "batch 21 3"]:
-        """Pose the keypoints alone; see `HandModel`."""
-        keypoint = self.local_keypoints(shape, articulation)
-        return place(keypoint, wrist_rotation, wrist_translation, scale)
-
     def local_vertices(
         self, shape: Float[Tensor, " 10"], articulation: Float[Tensor, "batch 15 3"]
     ) -> Float[Tensor, "batch vertex 3"]:

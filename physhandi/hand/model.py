@@ -8,6 +8,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from physhandi.hand.names import HandKind, HandSide
+from physhandi.hand.skinning import place
 
 SHAPE_COUNT = 10
 JOINT_COUNT = 15
@@ -106,7 +107,6 @@ class HandModel(ABC):
     ) -> Float[Tensor, "batch 21 3"]:
         """Compute the keypoints alone, in the wrist's frame [m, before scale]."""
 
-    @abstractmethod
     def keypoints(
         self,
         shape: Float[Tensor, " 10"],
@@ -116,3 +116,5 @@ class HandModel(ABC):
         scale: float | Float[Tensor, ""] = 1.0,
     ) -> Float[Tensor, "batch 21 3"]:
         """Compute the keypoints alone, as `__call__` does but without the surface."""
+        keypoint = self.local_keypoints(shape, articulation)
+        return place(keypoint, wrist_rotation, wrist_translation, scale)
